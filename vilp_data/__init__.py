@@ -1,0 +1,1 @@
+"""Episode logs in, latent shards out. The walk of an episode: sources -> decode -> align -> episodes -> split -> latents -> dataset."""

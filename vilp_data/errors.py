@@ -1,0 +1,77 @@
+"""Errors a user can act on: what is wrong, where, what was found, what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class VilpDataError(Exception):
+    """Base of every error that vilp_data raises on purpose.
+
+    The message is one to three lines: what and where, what was found, and after "->" what to do about it.
+    `exit_code` is what the command line ends with: 1 for findings in the data, 2 for wrong use.
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, *, where: object = None, found: object = None, remedy: str | None = None) -> None:
+        self.what = what
+        self.where = where
+        self.found = found
+        self.remedy = remedy
+        text = what if where is None else f"{where}: {what}"
+        if found is not None:
+            text += f"\n   found: {found}"
+        if remedy is not None:
+            text += f"\n   -> {remedy}"
+        super().__init__(text)
+
+    def __reduce__(self) -> tuple[object, ...]:  # keyword-only fields must survive the way back from a worker process
+        return _rebuild, (type(self), self.what, self.where, self.found, self.remedy)
+
+
+def _rebuild(cls: type[VilpDataError], what: str, where: object, found: object, remedy: str | None) -> VilpDataError:
+    return cls(what, where=where, found=found, remedy=remedy)
+
+
+class UsageError(VilpDataError):
+    """The command or call was wrong: a path that does not exist, options that contradict each other."""
+
+    exit_code = 2
+
+
+class SpecError(UsageError):
+    """A task TOML that cannot be used: unknown key, wrong type, contradictory values."""
+
+
+class LogError(VilpDataError):
+    """A log that cannot be read: not a log, empty, cut off, failing its CRC, missing a topic."""
+
+
+class DecodeError(VilpDataError):
+    """A message that cannot become a frame or a vector: unknown schema, wrong encoding, damaged image."""
+
+
+class AlignError(VilpDataError):
+    """Messages that cannot be put on one control clock."""
+
+
+class StoreError(VilpDataError):
+    """A stored file that is missing, damaged, of another format version, or cannot be written."""
+
+
+class BusyError(VilpDataError):
+    """Another process is writing this dataset."""
+
+
+class SplitError(VilpDataError):
+    """A split that cannot be drawn, or that does not fit the episodes at hand."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A remedy that names the nearest known name: `did you mean 'rate_hz'? known: ...`."""
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"{hint}known: {', '.join(names) if names else '(none)'}"

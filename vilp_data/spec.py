@@ -1,0 +1,233 @@
+"""TaskSpec: one TOML a task, validated into frozen models before anything runs."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vilp_data.errors import SpecError, nearest
+from vilp_data.types import Clock
+
+PRESETS = ("tiny", "cpu", "paper")
+
+
+class Frozen(BaseModel):
+    """A table of the TOML: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TopicSpec(Frozen):
+    """Where a value comes from and which clock stamps it.
+
+    clock          "header" (the message's own stamp), "log" (when the recorder received it) or "publish"
+    offset_s       added to the stamp, for a clock known to be off
+    stale_after_s  an older value makes the step invalid
+    """
+
+    topic: str
+    clock: Clock = "header"
+    offset_s: float = 0.0
+    stale_after_s: float = Field(default=0.5, gt=0)
+
+
+class ViewSpec(TopicSpec):
+    """A camera, and the size its images are stored at. `fit` says what to do with another aspect ratio; unstated is refused."""
+
+    height: int = Field(gt=0)
+    width: int = Field(gt=0)
+    fit: Literal["crop", "pad", "stretch"] | None = None
+
+
+class VectorSpec(TopicSpec):
+    """A vector read from a topic's messages.
+
+    fields  paths into the message, concatenated: "pose.position.x", "position", "position[0:7]", "[0:2]" for a bare array
+    names   for messages with parallel `name` lists (JointState): which joints, in this order; a robot may publish any order
+    """
+
+    fields: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+
+
+class ActionSpec(Frozen):
+    """One part of the action vector: a command topic, or a state some steps ahead for logs that recorded no commands.
+
+    kind "absolute": the last command issued in [t_k, t_{k+1}), else the one still held (grippers too)
+    kind "delta": commands issued in the interval summed, zero where there was none; never held
+    kind "delta_rotation": axis-angle vectors in radians, composed as rotations over the interval
+    """
+
+    topic: str | None = None
+    fields: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    clock: Clock = "header"
+    offset_s: float = 0.0
+    kind: Literal["absolute", "delta", "delta_rotation"] = "absolute"
+    unit: str = ""
+    frame: str = ""
+    from_: str | None = Field(default=None, alias="from")
+    shift: int = Field(default=1, ge=1)
+
+    @model_validator(mode="after")
+    def _one_origin(self) -> Self:
+        if (self.topic is None) == (self.from_ is None):
+            raise ValueError("an action part needs exactly one of `topic` (recorded commands) and `from` (a low_dim part, `shift` steps ahead)")
+        if self.from_ is not None and self.kind != "absolute":
+            raise ValueError(f"`from = {self.from_!r}` gives absolute targets, but kind = {self.kind!r}")
+        return self
+
+
+class SplitSpec(Frozen):
+    """ratio: share of training episodes. group_by, strata: tag names; episodes of one group stay on one side."""
+
+    ratio: float = Field(default=0.9, gt=0, lt=1)
+    seed: int = 0
+    group_by: str | None = None
+    strata: tuple[str, ...] = ()
+
+
+class WindowSpec(Frozen):
+    """n_plan_frames (paper N) frames, frame_stride (paper Δt) steps apart. `max_goal_steps` limits how far past the end a clip
+    may repeat the last frame, in planned frames."""
+
+    n_plan_frames: int = Field(default=6, gt=0)
+    frame_stride: int = Field(default=2, gt=0)
+    max_goal_frames: int = Field(default=6, ge=0)
+
+
+class SimSpec(Frozen):
+    """The simulator of this task: a gymnasium id, and keyword arguments for it."""
+
+    env: str
+    options: dict[str, Any] = {}
+
+
+class RecordSpec(Frozen):
+    """How many episodes `record` makes, from which seed on."""
+
+    episodes: int = Field(default=24, gt=0)
+    first_seed: int = Field(default=0, ge=0)
+
+
+class TaskSpec(Frozen):
+    """A task: what its logs hold, on which clock, at which size, and how models train on it.
+
+    rate_hz None means the rate of the slowest camera. `models` holds the tables of vilp_models, which validates them.
+    """
+
+    name: str
+    rate_hz: float | None = Field(default=None, gt=0)
+    views: dict[str, ViewSpec] = Field(min_length=1)
+    low_dim: dict[str, VectorSpec] = {}
+    action: dict[str, ActionSpec] = {}
+    state: VectorSpec | None = None
+    split: SplitSpec = SplitSpec()
+    window: WindowSpec = WindowSpec()
+    sim: SimSpec | None = None
+    record: RecordSpec = RecordSpec()
+    models: dict[str, dict[str, Any]] = {}
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> Self:
+        for part, spec in self.action.items():
+            if spec.from_ is not None and spec.from_ not in self.low_dim:
+                raise ValueError(f"action.{part}: from = {spec.from_!r} is no low_dim part; {nearest(spec.from_, self.low_dim)}")
+        for view in self.views:
+            if not view.replace("_", "").replace("-", "").isalnum():
+                raise ValueError(f"view name {view!r} becomes a folder name: letters, digits, - and _ only")
+        return self
+
+    def topics(self) -> list[str]:
+        """Every topic the spec reads, each once."""
+        parts: list[str | None] = [v.topic for v in self.views.values()] + [v.topic for v in self.low_dim.values()]
+        parts += [a.topic for a in self.action.values()]
+        parts += [self.state.topic] if self.state else []
+        return list(dict.fromkeys(t for t in parts if t is not None))
+
+    def ingest_fields(self) -> dict[str, Any]:
+        """What decides the bytes of an ingested episode, as plain data: part of every episode's key."""
+        return self.model_dump(mode="json", by_alias=True, include={"rate_hz", "views", "low_dim", "action", "state"})
+
+
+def load_task(name_or_path: str, *, preset: str | None = None) -> TaskSpec:
+    """The task called `name_or_path` (a built-in name such as "hanoi", or a path to a TOML), with a preset's overrides applied."""
+    if name_or_path.endswith(".toml"):
+        path = Path(name_or_path)
+        if not path.is_file():
+            raise SpecError("no such task file", where=path, remedy="give a path to a TOML, or one of: " + ", ".join(task_names()))
+        return parse_task(path.read_text(encoding="utf-8"), where=str(path), preset=preset)
+    if name_or_path not in task_names():
+        raise SpecError(f"no task called {name_or_path!r}", remedy=nearest(name_or_path, task_names()) + "; or give a path ending in .toml")
+    text = (resources.files("pipelines") / f"{name_or_path}.toml").read_text(encoding="utf-8")
+    return parse_task(text, where=f"pipelines/{name_or_path}.toml", preset=preset)
+
+
+def task_names() -> list[str]:
+    """The built-in tasks."""
+    return sorted(entry.name.removesuffix(".toml") for entry in resources.files("pipelines").iterdir() if entry.name.endswith(".toml"))
+
+
+def parse_task(text: str, *, where: str, preset: str | None = None) -> TaskSpec:
+    """Parse a task TOML. `[presets.NAME]` tables override the rest, table by table; SpecError says what and where."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SpecError("not valid TOML", where=where, found=str(error), remedy="correct that line") from error
+    presets = table.pop("presets", {})
+    for name in presets:
+        if name not in PRESETS:
+            raise SpecError(f"unknown preset [presets.{name}]", where=where, remedy=nearest(name, PRESETS))
+    if preset is not None:
+        if preset not in PRESETS:
+            raise SpecError(f"unknown preset {preset!r}", where=where, remedy=nearest(preset, PRESETS))
+        table = _merged(table, presets.get(preset, {}))
+    return _validated(table, where)
+
+
+def task_from_dict(table: dict[str, Any], *, where: str) -> TaskSpec:
+    """A resolved spec read back from dataset.json or a run's recipe."""
+    return _validated(table, where)
+
+
+def _validated(table: dict[str, Any], where: str) -> TaskSpec:
+    try:
+        return TaskSpec.model_validate(table)
+    except ValidationError as error:
+        raise SpecError("the task cannot be used", where=where, found="\n          ".join(_complaints(error)), remedy="docs/task_toml.md lists every key") from error
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        out[key] = _merged(out[key], value) if isinstance(value, dict) and isinstance(out.get(key), dict) else value
+    return out
+
+
+def _complaints(error: ValidationError) -> list[str]:
+    lines = []
+    for item in error.errors():
+        place = ".".join(str(part) for part in item["loc"]) or "(top level)"
+        if item["type"] == "extra_forbidden":
+            known = _known_keys(item["loc"])
+            close = difflib.get_close_matches(str(item["loc"][-1]), known, n=1, cutoff=0.5)
+            hint = f"; did you mean {close[0]!r}?" if close else f"; known here: {', '.join(known)}"
+            lines.append(f"unknown key {place}{hint}")
+        else:
+            lines.append(f"{place}: {item['msg']}")
+    return lines
+
+
+def _known_keys(location: tuple[int | str, ...]) -> list[str]:
+    """Keys allowed in the table that holds the key at `location`."""
+    tables: dict[str, type[Frozen]] = {
+        "views": ViewSpec, "low_dim": VectorSpec, "action": ActionSpec, "state": VectorSpec,
+        "split": SplitSpec, "window": WindowSpec, "sim": SimSpec, "record": RecordSpec,
+    }  # fmt: skip
+    table = tables.get(str(location[0]), TaskSpec) if len(location) > 1 else TaskSpec
+    return sorted(info.alias or name for name, info in table.model_fields.items())
