@@ -145,10 +145,8 @@ class TaskSpec(Frozen):
 
     def topics(self) -> list[str]:
         """Every topic the spec reads, each once."""
-        parts: list[str | None] = [v.topic for v in self.views.values()] + [v.topic for v in self.low_dim.values()]
-        parts += [a.topic for a in self.action.values()]
-        parts += [self.state.topic] if self.state else []
-        return list(dict.fromkeys(t for t in parts if t is not None))
+        specs: list[TopicSpec | ActionSpec] = [*self.views.values(), *self.low_dim.values(), *self.action.values(), *([self.state] if self.state else [])]
+        return list(dict.fromkeys(spec.topic for spec in specs if spec.topic is not None))
 
     def ingest_fields(self) -> dict[str, Any]:
         """What decides the bytes of an ingested episode, as plain data: part of every episode's key."""

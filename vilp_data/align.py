@@ -1,0 +1,132 @@
+"""Many rates onto one control clock: which value belongs to which step. Pure.
+
+The rules (docs/time.md), for ticks t_0, t_1, …: the observation at tick k is the latest message at or before t_k; the action of
+step k is the command in force over [t_k, t_{k+1}). Replaying an ingested episode in its simulator proves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vilp_data.errors import AlignError
+from vilp_data.types import F32, F64, I64, Bool
+
+TOLERANCE_NS = 1_000
+"""Stamps this close to a tick count as on it: what rounding to nanoseconds, or a stamp kept as float seconds, moves them by."""
+
+BACKWARD_JUMP_NS = 1_000_000_000
+"""A clock that goes back by more than this was reset, not jittered."""
+
+Index = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """For each tick, the message seen: its index (-1: none yet), its age, and whether it is fresh enough to use."""
+
+    index: Index
+    age_s: F32
+    valid: Bool
+
+
+def order_of(stamps_ns: I64, *, topic: str) -> Index:
+    """The order that sorts stamps in time, equal ones as they came. Raises AlignError where the clock was reset."""
+    if len(stamps_ns) > 1 and (jump := int(np.diff(stamps_ns).min())) < -BACKWARD_JUMP_NS:
+        raise AlignError(
+            "the clock jumps back", where=topic, found=f"a stamp {-jump / 1e9:.3f} s before the one that came before it",
+            remedy='read this topic by its arrival (clock = "log"), or cut the log at the jump',
+        )  # fmt: skip
+    return np.argsort(stamps_ns, kind="stable")
+
+
+def median_rate_hz(stamps_ns: I64) -> float:
+    """Messages a second, by the median interval. Needs two distinct stamps (else AlignError)."""
+    intervals = np.diff(stamps_ns)
+    intervals = intervals[intervals > 0]
+    if len(intervals) == 0:
+        raise AlignError("a rate needs two messages at different times", found=f"{len(stamps_ns)} message(s)", remedy="state rate_hz in the task TOML")
+    return float(1e9 / np.median(intervals))
+
+
+def control_ticks(view_stamps_ns: Mapping[str, I64], rate_hz: float) -> I64:
+    """Ticks at `rate_hz` from the first instant at which every view has an image to the last image of the view that ends first."""
+    start = max(int(stamps[0]) for stamps in view_stamps_ns.values())
+    end = min(int(stamps[-1]) for stamps in view_stamps_ns.values())
+    if end < start:
+        raise AlignError("the views do not overlap in time", found=f"one ends {(start - end) / 1e9:.3f} s before another begins", remedy="check the clocks with `vilp-data inspect`")
+    count = int((end + TOLERANCE_NS - start) * rate_hz / 1e9) + 1
+    return start + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def observe(stamps_ns: I64, ticks_ns: I64, *, stale_after_s: float) -> Observed:
+    """The latest message at or before each tick. `stamps_ns` ascending."""
+    index = np.searchsorted(stamps_ns, ticks_ns + TOLERANCE_NS, side="right") - 1
+    seen = index >= 0
+    age = np.full(len(ticks_ns), np.nan)
+    age[seen] = np.maximum(ticks_ns[seen] - stamps_ns[index[seen]], 0) / 1e9
+    return Observed(index, age.astype(np.float32), seen & (np.nan_to_num(age, nan=np.inf) <= stale_after_s))
+
+
+def command_in_force(stamps_ns: I64, ticks_ns: I64, *, period_ns: int) -> Index:
+    """For absolute targets: the last command issued before t_{k+1}, be it in [t_k, t_{k+1}) or held from before; -1 for none."""
+    return np.searchsorted(stamps_ns, _interval_ends(ticks_ns, period_ns), side="left") - 1
+
+
+def sum_deltas(stamps_ns: I64, values: F64, ticks_ns: I64, *, period_ns: int) -> F64:
+    """Displacements [M,D] issued in each [t_k, t_{k+1}), summed: [F,D]; zero where there was none."""
+    first, last = _interval_bounds(stamps_ns, ticks_ns, period_ns)
+    out: F64 = np.zeros((len(ticks_ns), values.shape[1]))
+    for k in np.flatnonzero(last > first):
+        out[k] = values[first[k] : last[k]].sum(axis=0)
+    return out
+
+
+def compose_rotations(stamps_ns: I64, values: F64, ticks_ns: I64, *, period_ns: int, tool_frame: bool) -> F64:
+    """Axis-angle rotations [M,3] (radians) issued in each [t_k, t_{k+1}), composed: [F,3]; zero where there was none.
+
+    Later rotations multiply from the left, or from the right where they are given in the tool's own, moving frame."""
+    first, last = _interval_bounds(stamps_ns, ticks_ns, period_ns)
+    out: F64 = np.zeros((len(ticks_ns), 3))
+    for k in np.flatnonzero(last > first):
+        if last[k] - first[k] == 1:
+            out[k] = values[first[k]]
+            continue
+        total = np.array([1.0, 0.0, 0.0, 0.0])
+        for rotation in values[first[k] : last[k]]:
+            q = _quaternion(rotation)
+            total = _product(total, q) if tool_frame else _product(q, total)
+        out[k] = _axis_angle(total)
+    return out
+
+
+def _interval_ends(ticks_ns: I64, period_ns: int) -> I64:
+    return np.append(ticks_ns[1:], ticks_ns[-1] + period_ns) - TOLERANCE_NS
+
+
+def _interval_bounds(stamps_ns: I64, ticks_ns: I64, period_ns: int) -> tuple[Index, Index]:
+    """Half-open ranges of messages: those issued in [t_k, t_{k+1})."""
+    first = np.searchsorted(stamps_ns, ticks_ns - TOLERANCE_NS, side="left")
+    return first, np.searchsorted(stamps_ns, _interval_ends(ticks_ns, period_ns), side="left")
+
+
+def _quaternion(axis_angle: F64) -> F64:
+    angle = float(np.linalg.norm(axis_angle))
+    return np.array([np.cos(angle / 2), *(np.sinc(angle / (2 * np.pi)) / 2 * axis_angle)])
+
+
+def _product(a: F64, b: F64) -> F64:
+    vector = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
+    return np.array([a[0] * b[0] - a[1:] @ b[1:], *vector])
+
+
+def _axis_angle(q: F64) -> F64:
+    q = q if q[0] >= 0 else -q
+    sine = float(np.linalg.norm(q[1:]))
+    if sine < 1e-12:
+        return 2 * q[1:]
+    angle = 2 * np.arctan2(sine, q[0])
+    return np.asarray(q[1:] * (angle / sine))
