@@ -1,0 +1,81 @@
+# make latents TASK=hanoi        episode logs -> cached VQGAN latents, everything before it included
+# make test                      lint, types, import rules, tests
+#
+# TASK    a task in pipelines/: hanoi, pusht      PRESET  tiny | cpu | paper
+# LOGS    your own logs (files or folders) instead of recorded ones
+# DATA    the dataset folder                      TORCH   what pip installs as torch
+
+TASK   ?= hanoi
+PRESET ?= cpu
+LOGS   ?=
+DATA   ?= data/$(TASK)$(if $(filter tiny,$(PRESET)),-tiny)
+TORCH  ?= torch==2.13.0
+PYTHON ?= python3
+
+BIN   := .venv/bin
+READY := .venv/.ready
+RUN   := $(DATA)/runs/vqgan-$(PRESET)
+LOGS_IN := $(if $(LOGS),$(LOGS),$(DATA)/logs)
+SUDO  := $(if $(filter 0,$(shell id -u)),,$(shell command -v sudo >/dev/null && echo sudo -n))
+
+export MUJOCO_GL ?= osmesa
+
+.PHONY: setup record ingest split vqgan latents view replay test test-slow lint bench docs clean help
+
+help:
+	@sed -n '1,8p' Makefile
+
+# --- set-up ----------------------------------------------------------------------------------------------------------
+
+setup: $(READY)
+
+$(READY): pyproject.toml bootstrap.sh
+	PYTHON='$(PYTHON)' TORCH='$(TORCH)' SUDO='$(SUDO)' sh bootstrap.sh
+	@touch $@
+
+# --- the walk of an episode; each step skips what is fresh -----------------------------------------------------------
+
+record: $(READY)
+	@$(if $(LOGS),echo "record: using LOGS=$(LOGS)",$(BIN)/vilp-data record --task $(TASK) --preset $(PRESET) --out $(DATA)/logs)
+
+ingest: record
+	@$(BIN)/vilp-data ingest $(LOGS_IN) --task $(TASK) --preset $(PRESET) --into $(DATA)
+
+split: ingest
+	@$(BIN)/vilp-data split $(DATA)
+
+vqgan: split
+	@$(BIN)/vilp-models train vqgan --data $(DATA) --task $(TASK) --preset $(PRESET)
+
+latents: vqgan
+	@$(BIN)/vilp-data latents $(DATA) --run $(RUN)
+	@$(BIN)/vilp-models evaluate vqgan --data $(DATA) --run $(RUN)
+
+view: $(READY)
+	@$(BIN)/vilp-data view $$(ls $(DATA)/logs/*.mcap | head -1)
+
+replay: ingest
+	@$(BIN)/vilp-models rollout --data $(DATA) --policy replay
+
+# --- the project -----------------------------------------------------------------------------------------------------
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint
+	$(BIN)/pytest
+
+test-slow: $(READY)
+	$(BIN)/pytest -m slow
+
+bench: $(READY)
+	@for bench in benchmarks/bench_*.py; do echo "== $$bench"; $(BIN)/python $$bench || exit 1; done
+
+docs: $(READY)
+	$(BIN)/python docs/make_cli_reference.py
+
+clean:
+	rm -rf build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
