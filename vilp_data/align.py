@@ -48,7 +48,11 @@ def median_rate_hz(stamps_ns: I64) -> float:
     intervals = np.diff(stamps_ns)
     intervals = intervals[intervals > 0]
     if len(intervals) == 0:
-        raise AlignError("a rate needs two messages at different times", found=f"{len(stamps_ns)} message(s)", remedy="state rate_hz in the task TOML")
+        raise AlignError(
+            "a rate needs two messages at different times",
+            found=f"{len(stamps_ns)} message(s)",
+            remedy="state rate_hz in the task TOML",
+        )
     return float(1e9 / np.median(intervals))
 
 
@@ -57,7 +61,11 @@ def control_ticks(view_stamps_ns: Mapping[str, I64], rate_hz: float) -> I64:
     start = max(int(stamps[0]) for stamps in view_stamps_ns.values())
     end = min(int(stamps[-1]) for stamps in view_stamps_ns.values())
     if end < start:
-        raise AlignError("the views do not overlap in time", found=f"one ends {(start - end) / 1e9:.3f} s before another begins", remedy="check the clocks with `vilp-data inspect`")
+        raise AlignError(
+            "the views do not overlap in time",
+            found=f"one ends {(start - end) / 1e9:.3f} s before another begins",
+            remedy="check the clocks with `vilp-data inspect`",
+        )
     count = int((end + TOLERANCE_NS - start) * rate_hz / 1e9) + 1
     return start + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 

@@ -35,18 +35,29 @@ def assemble_episode(log: LogReader, demonstration: LogEpisode, spec: TaskSpec, 
     refuse_short_stride(spec, view_stamps, rate_hz)
     ticks = align.control_ticks(view_stamps, rate_hz)
     if len(ticks) < 2:
-        raise AlignError("an episode of one step holds no motion to learn", where=f"{log.path}, {demonstration.name}", remedy="leave this log out")
+        raise AlignError(
+            "an episode of one step holds no motion to learn",
+            where=f"{log.path}, {demonstration.name}",
+            remedy="leave this log out",
+        )
 
-    seen = {view: align.observe(view_stamps[view], ticks, stale_after_s=view_spec.stale_after_s) for view, view_spec in spec.views.items()}
-    images = {view: _stored_images(tracks[view_spec.topic], seen[view].index, view_spec) for view, view_spec in spec.views.items()}
+    seen = {
+        view: align.observe(view_stamps[view], ticks, stale_after_s=view_spec.stale_after_s)
+        for view, view_spec in spec.views.items()
+    }
+    images = {
+        view: _stored_images(tracks[view_spec.topic], seen[view].index, view_spec)
+        for view, view_spec in spec.views.items()
+    }
     low_dim = {name: _observe_vector(part, tracks, ticks) for name, part in spec.low_dim.items()}
     state = _observe_vector(spec.state, tracks, ticks) if spec.state and spec.state.topic in tracks else None
     action = _actions(spec, tracks, ticks, low_dim, rate_hz)
 
     low_dim_values = np.concatenate([*(part.values for part in low_dim.values()), np.zeros((len(ticks), 0))], axis=1)
-    valid = {f"view {view}": observed.valid for view, observed in seen.items()}
+    valid: dict[str, Bool] = {f"view {view}": observed.valid for view, observed in seen.items()}
     valid |= {f"low_dim {name}": part.valid for name, part in low_dim.items()}
-    valid |= {} if action is None else {"action": np.isfinite(action).all(axis=1)}
+    if action is not None:
+        valid["action"] = np.asarray(np.isfinite(action).all(axis=1))
     ages = {spec.views[view].topic: observed.age_s for view, observed in seen.items()}
     ages |= {spec.low_dim[name].topic: part.age_s for name, part in low_dim.items()}
     return Episode(
@@ -103,7 +114,11 @@ def collect(log: LogReader, demonstration: LogEpisode, spec: TaskSpec, topics: S
         found[message.topic].append((stamp_ns(message, clocks[message.topic]), value))
     for topic, entries in found.items():
         if not entries:
-            raise LogError(f"no message on topic {topic!r}", where=f"{log.path}, {demonstration.name}", remedy="leave this log out, or take the topic out of the task TOML")
+            raise LogError(
+                f"no message on topic {topic!r}",
+                where=f"{log.path}, {demonstration.name}",
+                remedy="leave this log out, or take the topic out of the task TOML",
+            )
     return {topic: _track(entries, topic) for topic, entries in found.items()}
 
 
@@ -112,7 +127,12 @@ def stamp_ns(message: Message, spec: TopicSpec | ActionSpec) -> int:
     if spec.clock == "header":
         stamp = decode.header_time_ns(message)
         if stamp is None:
-            raise DecodeError("its messages carry no stamp of their own", where=message.topic, found=message.schema, remedy='set clock = "log" for this topic')
+            raise DecodeError(
+                "its messages carry no stamp of their own",
+                where=message.topic,
+                found=message.schema,
+                remedy='set clock = "log" for this topic',
+            )
     else:
         stamp = message.log_time_ns if spec.clock == "log" else message.publish_time_ns
     return stamp + round(spec.offset_s * 1e9)
@@ -137,7 +157,12 @@ def _vectors(track: Track, spec: VectorSpec | ActionSpec) -> F64:
     read = decode.compile_fields(spec.fields, spec.names)
     rows = [read(message) for message in track.values if isinstance(message, Message)]
     if len(lengths := {len(row) for row in rows}) > 1:
-        raise DecodeError("vectors of different lengths", where=spec.topic, found=f"lengths {sorted(lengths)}", remedy="say which fields to read, or which joints by `names`")
+        raise DecodeError(
+            "vectors of different lengths",
+            where=spec.topic,
+            found=f"lengths {sorted(lengths)}",
+            remedy="say which fields to read, or which joints by `names`",
+        )
     return np.asarray(rows, np.float64).reshape(len(rows), -1)
 
 
@@ -176,7 +201,9 @@ def _actions(spec: TaskSpec, tracks: Tracks, ticks: I64, low_dim: Mapping[str, _
     if not spec.action or any(part.topic is not None and part.topic not in tracks for part in spec.action.values()):
         return None
     period_ns = round(1e9 / rate_hz)
-    return np.concatenate([_action_part(part, tracks, ticks, low_dim, period_ns) for part in spec.action.values()], axis=1)
+    return np.concatenate(
+        [_action_part(part, tracks, ticks, low_dim, period_ns) for part in spec.action.values()], axis=1
+    )
 
 
 def _action_part(part: ActionSpec, tracks: Tracks, ticks: I64, low_dim: Mapping[str, _Vector], period_ns: int) -> F64:
@@ -189,8 +216,15 @@ def _action_part(part: ActionSpec, tracks: Tracks, ticks: I64, low_dim: Mapping[
         return align.sum_deltas(track.stamps_ns, values, ticks, period_ns=period_ns)
     if part.kind == "delta_rotation":
         if values.shape[1] != 3:
-            raise SpecError("a delta_rotation is an axis-angle vector of three numbers", where=part.topic, found=f"{values.shape[1]} numbers", remedy="name its three fields")
-        return align.compose_rotations(track.stamps_ns, values, ticks, period_ns=period_ns, tool_frame=part.frame == "tool")
+            raise SpecError(
+                "a delta_rotation is an axis-angle vector of three numbers",
+                where=part.topic,
+                found=f"{values.shape[1]} numbers",
+                remedy="name its three fields",
+            )
+        return align.compose_rotations(
+            track.stamps_ns, values, ticks, period_ns=period_ns, tool_frame=part.frame == "tool"
+        )
     index = align.command_in_force(track.stamps_ns, ticks, period_ns=period_ns)
     held = values[np.maximum(index, 0)]
     held[index < 0] = np.nan

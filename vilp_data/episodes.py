@@ -79,11 +79,22 @@ class EpisodeStore:
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError as error:
-            raise UsageError("not a dataset: it has no dataset.json", where=self.root, remedy="make one with `vilp-data ingest LOGS… --task NAME`") from error
+            raise UsageError(
+                "not a dataset: it has no dataset.json",
+                where=self.root,
+                remedy="make one with `vilp-data ingest LOGS… --task NAME`",
+            ) from error
         except ValueError as error:
-            raise StoreError("damaged", where=path, found=str(error), remedy="run `vilp-data ingest` again: it writes this file anew") from error
+            raise StoreError(
+                "damaged", where=path, found=str(error), remedy="run `vilp-data ingest` again: it writes this file anew"
+            ) from error
         if table.get("format") != FORMAT_VERSION:
-            raise StoreError("written by another version", where=path, found=f"format {table.get('format')}, this is {FORMAT_VERSION}", remedy="ingest the logs again into a new folder")
+            raise StoreError(
+                "written by another version",
+                where=path,
+                found=f"format {table.get('format')}, this is {FORMAT_VERSION}",
+                remedy="ingest the logs again into a new folder",
+            )
         return task_from_dict(table["spec"], where=str(path))
 
     def write_spec(self, spec: TaskSpec) -> None:
@@ -103,7 +114,11 @@ class EpisodeStore:
         for view, frames in episode.frames.items():
             header = {"format": str(FORMAT_VERSION), "key": origin.key, "frames_sha256": frames_sha256[view]}
             shards.write_shard(self.frames_path(view, episode.id), {"frames": frames}, header)
-        tensors: dict[str, Any] = {"log_time_ns": episode.log_time_ns, "low_dim": episode.low_dim, "valid": episode.valid}
+        tensors: dict[str, Any] = {
+            "log_time_ns": episode.log_time_ns,
+            "low_dim": episode.low_dim,
+            "valid": episode.valid,
+        }
         tensors |= {f"source_index/{view}": index for view, index in episode.source_index.items()}
         tensors |= {f"age_s/{topic}": age for topic, age in episode.age_s.items()}
         tensors |= {"action": episode.action} if episode.action is not None else {}
@@ -165,7 +180,11 @@ class EpisodeStore:
         """uint8 [n,H,W,3] of one view, checked to be the frames that the episode was committed with."""
         shard = shards.read_shard(self.frames_path(view, entry.id))
         if shard.metadata["frames_sha256"] != entry.frames_sha256[view]:
-            raise StoreError("not the frames this episode was committed with", where=self.frames_path(view, entry.id), remedy="run `vilp-data ingest` on its log again")
+            raise StoreError(
+                "not the frames this episode was committed with",
+                where=self.frames_path(view, entry.id),
+                remedy="run `vilp-data ingest` on its log again",
+            )
         return cast(U8, shard.arrays["frames"])
 
     def _steps_files(self) -> list[Path]:
@@ -176,7 +195,9 @@ class EpisodeStore:
         metadata = shards.read_header(path).metadata
         if metadata.get("format") != str(FORMAT_VERSION):
             found = f"format {metadata.get('format')}, this is {FORMAT_VERSION}"
-            raise StoreError("written by another version", where=path, found=found, remedy="ingest the logs again into a new folder")
+            raise StoreError(
+                "written by another version", where=path, found=found, remedy="ingest the logs again into a new folder"
+            )
         return _from_row(metadata)
 
     def _entries_from_headers(self) -> list[EpisodeEntry]:
@@ -186,7 +207,19 @@ class EpisodeStore:
 # One flat row of strings and numbers per episode, the same in a steps file's header and in index.parquet.
 _JSON_FIELDS = ("ingest", "tags", "findings", "frames_sha256", "n_frames")
 _INDEX_SCHEMA = pa.schema(
-    [(name, pa.string()) for name in ("id", "source", "source_sha256", "source_episode", "key", "outcome", "content_sha256", *_JSON_FIELDS)]
+    [
+        (name, pa.string())
+        for name in (
+            "id",
+            "source",
+            "source_sha256",
+            "source_episode",
+            "key",
+            "outcome",
+            "content_sha256",
+            *_JSON_FIELDS,
+        )
+    ]
     + [("n_steps", pa.int64()), ("n_valid", pa.int64()), ("file_bytes", pa.int64()), ("rate_hz", pa.float64())]
     + [("has_action", pa.bool_()), ("has_state", pa.bool_())]
 )

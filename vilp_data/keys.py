@@ -15,7 +15,9 @@ FORMAT_VERSION = 1
 
 def digest(value: Any) -> str:
     """SHA-256 of plain data (dicts, lists, strings, numbers, None) in canonical JSON, lower-case hex."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    ).hexdigest()
 
 
 def content_digest(*arrays: npt.NDArray[Any]) -> str:
@@ -29,4 +31,6 @@ def content_digest(*arrays: npt.NDArray[Any]) -> str:
 
 def episode_key(*, source_sha256: str, source_episode: str, ingest_fields: Mapping[str, Any]) -> str:
     """Key of an ingested episode: the log's bytes, which demonstration in it, the resolved ingest spec, the format version."""
-    return digest({"format": FORMAT_VERSION, "source": source_sha256, "episode": source_episode, "ingest": dict(ingest_fields)})
+    return digest(
+        {"format": FORMAT_VERSION, "source": source_sha256, "episode": source_episode, "ingest": dict(ingest_fields)}
+    )

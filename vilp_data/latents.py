@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, cast
@@ -21,13 +23,26 @@ from vilp_data.types import F16, U8
 BATCH = 16
 """Frames encoded at a time. Batches never cross episodes, so an episode's bytes do not depend on its neighbours."""
 
+BARE_BATCHES = 3
+"""Batches that the bare forward loop is timed on."""
+
 
 class FrameEncoder(Protocol):
     """What turns frames into latents and back. vilp_models has one; others join through the entry-point group."""
 
     @property
     def key(self) -> str:
-        """Digest of everything that decides the latents' bytes: weights, scaling, compute and storage dtype."""
+        """Digest of `key_fields`: everything that decides the latents' bytes, and nothing else."""
+        ...
+
+    @property
+    def key_fields(self) -> dict[str, str]:
+        """What goes into the key, by name, so that a stale latent can say why: weights, scaling, compute and storage dtype."""
+        ...
+
+    @property
+    def trained_on(self) -> frozenset[str]:
+        """Keys of the episodes whose frames it was trained on."""
         ...
 
     def encode(self, frames: U8) -> F16:
@@ -90,39 +105,43 @@ def missing_latents(store: EpisodeStore, encoder_name: str, run_dir: Path, keys:
     ]
 
 
-def encode_episodes(
-    jobs: Sequence[LatentJob], *, workers: int, progress: Callable[[LatentJob, int, float], None] | None = None
-) -> int:
-    """Make the shards; returns the number of frames encoded. Each worker computes on one thread, so bytes do not depend on how
-    many there are. `progress(job, frames, seconds)` is told each shard and the seconds its worker spent on it.
+@dataclass(frozen=True)
+class EncodedShard:
+    """What making one shard took: the worker's seconds on its `frames`, and the frames/s of its bare forward loop."""
 
-    Call inside `shards.writer_lock`. Killed at any moment, the next call makes what is missing."""
-    total = 0
-    for job, (frames, seconds) in map_unordered(encode_one, jobs, workers=workers, initializer=_one_thread):
-        total += frames
-        if progress is not None:
-            progress(job, frames, seconds)
-    return total
+    frames: int
+    seconds: float
+    bare_frames_per_s: float
 
 
-def encode_one(job: LatentJob) -> tuple[int, float]:
-    """Encode one episode's frames of one view and write the shard: (frames, seconds)."""
-    import time
+def encode_episodes(jobs: Sequence[LatentJob], *, workers: int) -> Iterator[tuple[LatentJob, EncodedShard]]:
+    """Make the shards, yielding each as it is done. Each worker computes on one thread, so bytes do not depend on how many
+    there are. Call inside `shards.writer_lock`. Killed at any moment, the next call makes what is missing."""
+    yield from map_unordered(encode_one, jobs, workers=workers, initializer=_one_thread)
 
+
+def encode_one(job: LatentJob) -> EncodedShard:
+    """Encode one episode's frames of one view and write the shard."""
     encoder = _encoder_of(job)
     store = EpisodeStore(job.root)
     entry = store.entry_from_header(store.steps_path(job.episode_id))
+    bare = _bare_frames_per_s(job, store, entry)
     started = time.perf_counter()
     frames = store.read_frames(job.view, entry)
     latents = np.concatenate(list(encode_batches(encoder, frames)))
+    path = latents_path(job.root, job.view, job.key, job.episode_id)
     if not np.isfinite(latents).all():
+        found = f"{np.count_nonzero(~np.isfinite(latents))} values beyond float16"
         raise StoreError(
-            "latents that are not finite in float16", where=latents_path(job.root, job.view, job.key, job.episode_id),
-            found=f"{np.count_nonzero(~np.isfinite(latents))} values", remedy="the encoder's training has diverged: train it again",
-        )  # fmt: skip
-    header = {"format": str(FORMAT_VERSION), "key": job.key, "source_frames_sha256": entry.frames_sha256[job.view], "source_key": entry.key}
-    shards.write_shard(latents_path(job.root, job.view, job.key, job.episode_id), {"latents": latents}, header)
-    return len(frames), time.perf_counter() - started
+            "latents that cannot be stored",
+            where=path,
+            found=found,
+            remedy="the encoder's training diverged: train it again",
+        )
+    header = {"format": str(FORMAT_VERSION), "key": job.key, "encoder": json.dumps(encoder.key_fields, sort_keys=True)}
+    header |= {"source_frames_sha256": entry.frames_sha256[job.view], "source_key": entry.key}
+    shards.write_shard(path, {"latents": latents}, header)
+    return EncodedShard(len(frames), time.perf_counter() - started, bare)
 
 
 def encode_batches(encoder: FrameEncoder, frames: U8) -> Iterator[F16]:
@@ -131,7 +150,24 @@ def encode_batches(encoder: FrameEncoder, frames: U8) -> Iterator[F16]:
         yield encoder.encode(frames[start : start + BATCH])
 
 
+# --- in a worker process -------------------------------------------------------------------------------------------------
+
 _encoders: dict[tuple[str, Path, str], FrameEncoder] = {}
+_bare_rates: dict[tuple[str, Path, str], float] = {}
+
+
+def _bare_frames_per_s(job: LatentJob, store: EpisodeStore, entry: EpisodeEntry) -> float:
+    """Frames/s of encoding one batch that lies in memory, again and again: what reading and writing are measured against.
+    Measured once for each worker process, run and view."""
+    name = (job.encoder_name, job.run_dir, job.view)
+    if name not in _bare_rates:
+        frames = np.array(shards.open_shard(store.frames_path(job.view, entry.id)).arrays["frames"][:BATCH])
+        _encoder_of(job).encode(frames)
+        started = time.perf_counter()
+        for _ in range(BARE_BATCHES):
+            _encoder_of(job).encode(frames)
+        _bare_rates[name] = BARE_BATCHES * len(frames) / (time.perf_counter() - started)
+    return _bare_rates[name]
 
 
 def _encoder_of(job: LatentJob) -> FrameEncoder:
@@ -140,7 +176,9 @@ def _encoder_of(job: LatentJob) -> FrameEncoder:
     if name not in _encoders:
         _encoders[name] = load_encoder(*name)
     if _encoders[name].key != job.key:
-        raise StoreError("the encoder changed while its latents were made", where=job.run_dir, remedy="run `vilp-data latents` again")
+        raise StoreError(
+            "the encoder changed while its latents were made", where=job.run_dir, remedy="run `vilp-data latents` again"
+        )
     return _encoders[name]
 
 

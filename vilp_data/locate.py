@@ -54,4 +54,8 @@ def _datasets() -> list[Path]:
 
 def _known() -> str:
     known = ", ".join(map(str, _datasets()))
-    return f"name its folder; under data/ there are: {known}" if known else "make one with `vilp-data ingest LOGS… --task NAME`"
+    return (
+        f"name its folder; under data/ there are: {known}"
+        if known
+        else "make one with `vilp-data ingest LOGS… --task NAME`"
+    )

@@ -63,16 +63,29 @@ def write_shard(path: Path, tensors: Mapping[str, npt.NDArray[Any]], metadata: M
     """Write tensors and metadata to `path`, atomically. A checksum over all of it joins the metadata under "sha256".
 
     Raises StoreError where the disk is full or the folder cannot be written; `path` is then as it was before."""
-    arrays = {name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors, key=lambda n: (-tensors[n].dtype.itemsize, n))}
+    arrays = {
+        name: np.asarray(tensors[name], order="C")
+        for name in sorted(tensors, key=lambda n: (-tensors[n].dtype.itemsize, n))
+    }
     layout: dict[str, Any] = {}
     offset = 0
     for name, array in arrays.items():
         if array.dtype not in _NAMES:
-            raise StoreError(f"tensor {name!r} has dtype {array.dtype}, which is not stored", where=path, remedy=f"use one of {', '.join(map(str, _NAMES))}")
-        layout[name] = {"dtype": _NAMES[array.dtype], "shape": list(array.shape), "data_offsets": [offset, offset + array.nbytes]}
+            raise StoreError(
+                f"tensor {name!r} has dtype {array.dtype}, which is not stored",
+                where=path,
+                remedy=f"use one of {', '.join(map(str, _NAMES))}",
+            )
+        layout[name] = {
+            "dtype": _NAMES[array.dtype],
+            "shape": list(array.shape),
+            "data_offsets": [offset, offset + array.nbytes],
+        }
         offset += array.nbytes
     checksum = _checksum(layout, metadata, (_bytes(array) for array in arrays.values()))
-    header = json.dumps({"__metadata__": {**metadata, _CHECKSUM: checksum}, **layout}, sort_keys=True, separators=(",", ":")).encode()
+    header = json.dumps(
+        {"__metadata__": {**metadata, _CHECKSUM: checksum}, **layout}, sort_keys=True, separators=(",", ":")
+    ).encode()
     header += b" " * (-(8 + len(header)) % _ALIGNMENT)
     with atomic_file(path) as file:
         file.write(struct.pack("<Q", len(header)))
@@ -87,7 +100,9 @@ def read_header(path: Path) -> ShardHeader:
         with path.open("rb") as file:
             return _parse_header(path, file, os.fstat(file.fileno()).st_size)
     except OSError as error:
-        raise StoreError("cannot be read", where=path, found=error.strerror, remedy="run the command that makes it again") from error
+        raise StoreError(
+            "cannot be read", where=path, found=error.strerror, remedy="run the command that makes it again"
+        ) from error
 
 
 def open_shard(path: Path) -> Shard:
@@ -146,7 +161,10 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         _sync_folder(path.parent)
     except OSError as error:
         raise StoreError(
-            "cannot be written", where=error.filename or path, found=error.strerror, remedy="free some space, or check the folder's permissions; nothing was replaced"
+            "cannot be written",
+            where=error.filename or path,
+            found=error.strerror,
+            remedy="free some space, or check the folder's permissions; nothing was replaced",
         ) from error
 
 
@@ -159,12 +177,19 @@ def writer_lock(root: Path) -> Iterator[None]:
         root.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(root / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
-        raise StoreError("the dataset folder cannot be written", where=root, found=error.strerror, remedy="check its permissions, or choose another folder") from error
+        raise StoreError(
+            "the dataset folder cannot be written",
+            where=root,
+            found=error.strerror,
+            remedy="check its permissions, or choose another folder",
+        ) from error
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise BusyError("another process is writing this dataset", where=root, remedy="wait until it is done, or stop it") from error
+            raise BusyError(
+                "another process is writing this dataset", where=root, remedy="wait until it is done, or stop it"
+            ) from error
         _remove_leftovers(root)
         yield
     finally:
@@ -193,7 +218,11 @@ def _sync_folder(folder: Path) -> None:
 
 def _view(data: npt.NDArray[np.uint8], info: TensorInfo) -> npt.NDArray[Any]:
     count = int(np.prod(info.shape, dtype=np.int64))
-    return np.frombuffer(data, dtype=info.dtype, count=count, offset=info.start).reshape(info.shape) if count else np.empty(info.shape, info.dtype)
+    return (
+        np.frombuffer(data, dtype=info.dtype, count=count, offset=info.start).reshape(info.shape)
+        if count
+        else np.empty(info.shape, info.dtype)
+    )
 
 
 def _parse_header(path: Path, file: BinaryIO, size: int) -> ShardHeader:
@@ -201,7 +230,12 @@ def _parse_header(path: Path, file: BinaryIO, size: int) -> ShardHeader:
     start = file.read(8)
     length = struct.unpack("<Q", start)[0] if len(start) == 8 else -1
     if not 2 <= length <= min(_MAX_HEADER_BYTES, size - 8):
-        raise StoreError("not a safetensors file", where=path, found=f"{size} bytes that begin with {start[:8].hex(' ')}", remedy=remedy)
+        raise StoreError(
+            "not a safetensors file",
+            where=path,
+            found=f"{size} bytes that begin with {start[:8].hex(' ')}",
+            remedy=remedy,
+        )
     try:
         table = json.loads(file.read(length))
         metadata = {str(key): str(value) for key, value in table.pop("__metadata__", {}).items()}
@@ -210,7 +244,9 @@ def _parse_header(path: Path, file: BinaryIO, size: int) -> ShardHeader:
         raise StoreError("its header cannot be read", where=path, found=str(error), remedy=remedy) from error
     end = max((info.end for info in tensors.values()), default=8 + length)
     if end != size:
-        raise StoreError("its size is not what its header says", where=path, found=f"{size} bytes instead of {end}", remedy=remedy)
+        raise StoreError(
+            "its size is not what its header says", where=path, found=f"{size} bytes instead of {end}", remedy=remedy
+        )
     return ShardHeader(metadata, tensors)
 
 
@@ -225,13 +261,24 @@ def _tensor_info(entry: dict[str, Any], data_start: int) -> TensorInfo:
 def _verify(path: Path, header: ShardHeader, data: npt.NDArray[np.uint8]) -> None:
     start = min((info.start for info in header.tensors.values()), default=0)
     layout = {
-        name: {"dtype": _NAMES[info.dtype], "shape": list(info.shape), "data_offsets": [info.start - start, info.end - start]}
+        name: {
+            "dtype": _NAMES[info.dtype],
+            "shape": list(info.shape),
+            "data_offsets": [info.start - start, info.end - start],
+        }
         for name, info in header.tensors.items()
     }
     metadata = {key: value for key, value in header.metadata.items() if key != _CHECKSUM}
     ordered = sorted(header.tensors.values(), key=lambda info: info.start)
-    if _checksum(layout, metadata, (data[info.start : info.end].data for info in ordered)) != header.metadata.get(_CHECKSUM):
-        raise StoreError("its checksum does not match", where=path, found="bytes that changed since it was written", remedy="delete it and run the command that makes it again")
+    if _checksum(layout, metadata, (data[info.start : info.end].data for info in ordered)) != header.metadata.get(
+        _CHECKSUM
+    ):
+        raise StoreError(
+            "its checksum does not match",
+            where=path,
+            found="bytes that changed since it was written",
+            remedy="delete it and run the command that makes it again",
+        )
 
 
 def _checksum(layout: Mapping[str, Any], metadata: Mapping[str, str], chunks: Iterator[memoryview]) -> str:

@@ -60,7 +60,8 @@ class ActionSpec(Frozen):
 
     kind "absolute": the last command issued in [t_k, t_{k+1}), else the one still held (grippers too)
     kind "delta": commands issued in the interval summed, zero where there was none; never held
-    kind "delta_rotation": axis-angle vectors in radians, composed as rotations over the interval
+    kind "delta_rotation": axis-angle vectors in radians, composed as rotations over the interval; `frame` says in which order:
+                 "base" and "world" (fixed) or "tool" (moving with the tool)
     """
 
     topic: str | None = None
@@ -77,7 +78,13 @@ class ActionSpec(Frozen):
     @model_validator(mode="after")
     def _one_origin(self) -> Self:
         if (self.topic is None) == (self.from_ is None):
-            raise ValueError("an action part needs exactly one of `topic` (recorded commands) and `from` (a low_dim part, `shift` steps ahead)")
+            raise ValueError(
+                "an action part needs exactly one of `topic` (recorded commands) and `from` (a low_dim part, `shift` steps ahead)"
+            )
+        if self.kind == "delta_rotation" and self.frame not in ("base", "world", "tool"):
+            raise ValueError(
+                f'a delta_rotation composes differently by its frame: frame = "base", "world" or "tool", not {self.frame!r}'
+            )
         if self.from_ is not None and self.kind != "absolute":
             raise ValueError(f"`from = {self.from_!r}` gives absolute targets, but kind = {self.kind!r}")
         return self
@@ -93,8 +100,8 @@ class SplitSpec(Frozen):
 
 
 class WindowSpec(Frozen):
-    """n_plan_frames (paper N) frames, frame_stride (paper Δt) steps apart. `max_goal_steps` limits how far past the end a clip
-    may repeat the last frame, in planned frames."""
+    """n_plan_frames (paper N) frames, frame_stride (paper Δt) steps apart. `max_goal_frames` limits how far past the end a clip
+    may repeat the last frame."""
 
     n_plan_frames: int = Field(default=6, gt=0)
     frame_stride: int = Field(default=2, gt=0)
@@ -137,16 +144,40 @@ class TaskSpec(Frozen):
     def _names_fit(self) -> Self:
         for part, spec in self.action.items():
             if spec.from_ is not None and spec.from_ not in self.low_dim:
-                raise ValueError(f"action.{part}: from = {spec.from_!r} is no low_dim part; {nearest(spec.from_, self.low_dim)}")
+                raise ValueError(
+                    f"action.{part}: from = {spec.from_!r} is no low_dim part; {nearest(spec.from_, self.low_dim)}"
+                )
         for view in self.views:
             if not view.replace("_", "").replace("-", "").isalnum():
                 raise ValueError(f"view name {view!r} becomes a folder name: letters, digits, - and _ only")
         return self
 
+    @model_validator(mode="after")
+    def _one_clock_a_topic(self) -> Self:
+        for spec in self._topic_specs():
+            first = self.clocks()[str(spec.topic)]
+            if (spec.clock, spec.offset_s) != (first.clock, first.offset_s):
+                raise ValueError(
+                    f"topic {spec.topic!r} is read by two clocks: {first.clock} {first.offset_s:+} s and {spec.clock} {spec.offset_s:+} s"
+                )
+        return self
+
+    def clocks(self) -> dict[str, TopicSpec | ActionSpec]:
+        """Topic -> the table that says which clock stamps it."""
+        return {str(spec.topic): spec for spec in reversed(self._topic_specs())}
+
     def topics(self) -> list[str]:
         """Every topic the spec reads, each once."""
-        specs: list[TopicSpec | ActionSpec] = [*self.views.values(), *self.low_dim.values(), *self.action.values(), *([self.state] if self.state else [])]
-        return list(dict.fromkeys(spec.topic for spec in specs if spec.topic is not None))
+        return list(dict.fromkeys(str(spec.topic) for spec in self._topic_specs()))
+
+    def _topic_specs(self) -> list[TopicSpec | ActionSpec]:
+        specs: list[TopicSpec | ActionSpec] = [
+            *self.views.values(),
+            *self.low_dim.values(),
+            *self.action.values(),
+            *([self.state] if self.state else []),
+        ]
+        return [spec for spec in specs if spec.topic is not None]
 
     def ingest_fields(self) -> dict[str, Any]:
         """What decides the bytes of an ingested episode, as plain data: part of every episode's key."""
@@ -158,17 +189,26 @@ def load_task(name_or_path: str, *, preset: str | None = None) -> TaskSpec:
     if name_or_path.endswith(".toml"):
         path = Path(name_or_path)
         if not path.is_file():
-            raise SpecError("no such task file", where=path, remedy="give a path to a TOML, or one of: " + ", ".join(task_names()))
+            raise SpecError(
+                "no such task file", where=path, remedy="give a path to a TOML, or one of: " + ", ".join(task_names())
+            )
         return parse_task(path.read_text(encoding="utf-8"), where=str(path), preset=preset)
     if name_or_path not in task_names():
-        raise SpecError(f"no task called {name_or_path!r}", remedy=nearest(name_or_path, task_names()) + "; or give a path ending in .toml")
+        raise SpecError(
+            f"no task called {name_or_path!r}",
+            remedy=nearest(name_or_path, task_names()) + "; or give a path ending in .toml",
+        )
     text = (resources.files("pipelines") / f"{name_or_path}.toml").read_text(encoding="utf-8")
     return parse_task(text, where=f"pipelines/{name_or_path}.toml", preset=preset)
 
 
 def task_names() -> list[str]:
     """The built-in tasks."""
-    return sorted(entry.name.removesuffix(".toml") for entry in resources.files("pipelines").iterdir() if entry.name.endswith(".toml"))
+    return sorted(
+        entry.name.removesuffix(".toml")
+        for entry in resources.files("pipelines").iterdir()
+        if entry.name.endswith(".toml")
+    )
 
 
 def parse_task(text: str, *, where: str, preset: str | None = None) -> TaskSpec:
@@ -197,7 +237,12 @@ def _validated(table: dict[str, Any], where: str) -> TaskSpec:
     try:
         return TaskSpec.model_validate(table)
     except ValidationError as error:
-        raise SpecError("the task cannot be used", where=where, found="\n          ".join(_complaints(error)), remedy="docs/task_toml.md lists every key") from error
+        raise SpecError(
+            "the task cannot be used",
+            where=where,
+            found="\n          ".join(_complaints(error)),
+            remedy="docs/task_toml.md lists every key",
+        ) from error
 
 
 def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

@@ -56,7 +56,8 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class LogEpisode:
-    """A demonstration inside a log: messages with start_ns <= log time < end_ns. `name` is unique within the log and stable."""
+    """A demonstration inside a log: messages with start_ns <= log time < end_ns. `name` is unique within the log
+    and does not depend on what the file is called."""
 
     name: str
     start_ns: int
@@ -90,14 +91,18 @@ class LogReader(Protocol):
         """The demonstrations in this log, in order of time. An MCAP file is one, unless something says otherwise."""
         ...
 
-    def messages(self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
+    def messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
         """Messages of `topics` with start_ns <= log time < end_ns, in order of log time, checksums verified.
 
         Raises LogError where the log lacks a topic (naming the nearest one), is cut off, or fails a checksum."""
         ...
 
     def __enter__(self) -> Self: ...
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
 
 
 # --- episodes -------------------------------------------------------------------------------------------------------
@@ -134,29 +139,3 @@ class Episode:
     @property
     def n_steps(self) -> int:
         return len(self.log_time_ns)
-
-
-# --- windows --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class WindowBatch:
-    """B windows of one batch, as stored; models normalise inside.
-
-    frames        view -> uint8 [B,H,W,3]: the observation's image at the window's first step t
-    latents       view -> float16 [B,N,c,h,w]: planned frames t+Δt … t+NΔt, before quantisation
-    latent_mask   bool [B,N]: False where the planned frame lies past the end and repeats the last one
-    low_dim       float32 [B,L] at t
-    action        float32 [B,NΔt,A] at t … t+NΔt-1, or None when no episode at hand has actions
-    action_mask   bool [B,NΔt]: False past the end, and for episodes without actions
-    episode       int64 [B], step int64 [B]: where each window begins
-    """
-
-    frames: Mapping[str, U8]
-    latents: Mapping[str, F16]
-    latent_mask: Bool
-    low_dim: F32
-    action: F32 | None
-    action_mask: Bool
-    episode: I64
-    step: I64

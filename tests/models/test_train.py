@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.models.conftest import HEIGHT, WIDTH, tiny_recipe
+from vilp_data.episodes import EpisodeStore
+from vilp_data.errors import StoreError, UsageError
+from vilp_data.shards import open_shard, write_shard
+from vilp_data.spec import TaskSpec
+from vilp_models.checkpoint import FILE, load_checkpoint, read_state, run_folder
+from vilp_models.recipe import VqganRecipe
+from vilp_models.train import train_vqgan
+from vilp_models.vqgan import load_frame_encoder
+from vilp_models.vqgan_training import DivergedError, VqganTraining
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    return tmp_path / "vqgan"
+
+
+def _train(
+    store: EpisodeStore, spec: TaskSpec, recipe: VqganRecipe, run_dir: Path, episodes: str = "abc", **options: bool
+) -> None:
+    train_vqgan(store.root, spec, recipe, run_dir, train_episodes=list(episodes), split_hash="s", show=False, **options)
+
+
+def _interrupt_at(monkeypatch: pytest.MonkeyPatch, index: int, error: type[Exception] | None = None) -> None:
+    """Send Ctrl-C, or raise, in the middle of step `index`."""
+    step = VqganTraining.step
+
+    def interrupted(self: VqganTraining, at: int) -> dict[str, float]:
+        if at == index and error is not None:
+            raise error("stopped")
+        if at == index:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, at)
+
+    monkeypatch.setattr(VqganTraining, "step", interrupted)
+
+
+def test_one_network_a_view_or_one_for_all(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    _train(store, spec, tiny_recipe(), run_dir / "own")
+    assert sorted(p.name for p in (run_dir / "own").iterdir()) == ["front", "side"]
+    assert load_frame_encoder(run_dir / "own", "front").key != load_frame_encoder(run_dir / "own", "side").key
+    _train(store, spec, tiny_recipe(share_views=True), run_dir / "shared")
+    assert load_frame_encoder(run_dir / "shared", "front").key == load_frame_encoder(run_dir / "shared", "side").key
+
+
+def test_a_trained_encoder_encodes_and_knows_its_episodes(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    encoder = load_frame_encoder(run_dir, "front")
+    frames = open_shard(store.frames_path("front", "d")).arrays["frames"]
+    assert encoder.encode(frames).shape == (len(frames), 3, HEIGHT // 4, WIDTH // 4)
+    assert encoder.trained_on == {"key-a", "key-b", "key-c"}
+    with pytest.raises(UsageError, match="front"):
+        load_frame_encoder(run_dir, "frnt")
+
+
+def test_ctrl_c_saves_and_resuming_gives_the_same_bytes(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny_recipe(share_views=True)
+    _train(store, spec, recipe, run_dir / "whole")
+    with monkeypatch.context() as patch:
+        _interrupt_at(patch, 2)
+        with pytest.raises(KeyboardInterrupt):
+            _train(store, spec, recipe, run_dir / "cut")
+    run = run_folder(run_dir / "cut", ("front", "side"))
+    state = read_state(run)
+    assert state is not None
+    assert (state.step, state.finished) == (3, False)
+    _train(store, spec, recipe, run_dir / "cut")
+    assert (run / FILE).read_bytes() == (run_folder(run_dir / "whole", ("front", "side")) / FILE).read_bytes()
+
+
+def test_a_diverging_run_keeps_its_last_checkpoint(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tiny_recipe(share_views=True)
+    with monkeypatch.context() as patch:
+        _interrupt_at(patch, 2)
+        with pytest.raises(KeyboardInterrupt):
+            _train(store, spec, recipe, run_dir)
+    run = run_folder(run_dir, ("front", "side"))
+    good = (run / FILE).read_bytes()
+    with monkeypatch.context() as patch:
+        _interrupt_at(patch, 4, DivergedError)
+        with pytest.raises(DivergedError):
+            _train(store, spec, recipe, run_dir)
+    assert (run / FILE).read_bytes() == good
+
+
+def test_a_finished_run_is_not_done_again(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    _interrupt_at(monkeypatch, 0, AssertionError)
+    _train(store, spec, tiny_recipe(), run_dir)
+
+
+def test_episodes_added_later_leave_a_finished_run_as_it_is(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    _train(store, spec, tiny_recipe(), run_dir, "abc")
+    before = load_frame_encoder(run_dir, "front").key
+    _train(store, spec, tiny_recipe(), run_dir, "abcd")
+    assert load_frame_encoder(run_dir, "front").key == before
+
+
+def test_another_recipe_or_lost_episodes_are_refused_unless_restarted(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path
+) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    with pytest.raises(UsageError, match="learning_rate = 0.002 there, 0.01 now"):
+        _train(store, spec, tiny_recipe(learning_rate=1e-2), run_dir)
+    with pytest.raises(UsageError, match="found: c"):
+        _train(store, spec, tiny_recipe(), run_dir, "ab")
+    _train(store, spec, tiny_recipe(), run_dir, "ab", restart=True)
+    assert load_frame_encoder(run_dir, "front").trained_on == {"key-a", "key-b"}
+
+
+def test_an_unknown_episode_is_named(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    with pytest.raises(UsageError, match="'x'"):
+        _train(store, spec, tiny_recipe(), run_dir, "ax")
+
+
+def test_the_checkpoint_says_what_it_was_trained_on(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    checkpoint = load_checkpoint(run_folder(run_dir, ("front",)))
+    assert checkpoint.state.split_hash == "s"
+    assert checkpoint.state.train_episodes == {e: f"key-{e}" for e in "abc"}
+    assert VqganRecipe.model_validate(checkpoint.recipe) == tiny_recipe()
+    assert VqganRecipe.model_validate(json.loads((run_dir / "front" / "recipe.json").read_text())) == tiny_recipe()
+
+
+def test_a_checkpoint_of_another_format_or_a_damaged_one_is_refused(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path
+) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    path = run_dir / "front" / FILE
+    good = path.read_bytes()
+    path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+    with pytest.raises(StoreError, match="checksum"):
+        load_frame_encoder(run_dir, "front")
+    write_shard(path, {"x": np.zeros(1, np.float32)}, {"format": "vilp-checkpoint-0"})
+    with pytest.raises(StoreError, match="vilp-checkpoint-0"):
+        load_frame_encoder(run_dir, "front")

@@ -1,0 +1,319 @@
+"""MCAP: what was written comes back, in order, whole; and what cannot be trusted is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from tests.real_data import real_data
+from tests.synthetic import ACTION_TOPIC, HEADER_LAG_NS, JOINT_TOPIC, START_NS, Encoding, image_topic, write_mcap
+from vilp_data.decode import decode_vector
+from vilp_data.errors import LogError
+from vilp_data.sources import open_log
+from vilp_data.types import Message
+
+ENCODINGS: tuple[Encoding, ...] = ("cdr", "protobuf", "json")
+
+
+def read(path: Path, topics: list[str] | None = None, **bounds: int) -> list[Message]:
+    with open_log(path) as log:
+        return list(log.messages([t.name for t in log.topics()] if topics is None else topics, **bounds))
+
+
+def write_json(
+    path: Path, times: list[int], topic: str = "/t", *, before: Callable[[Writer], Any] = lambda w: None, **options: Any
+) -> Path:
+    """A log of small JSON messages at these log times, in this order."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("", "test")
+        before(writer)
+        channel = writer.register_channel(topic, "json", writer.register_schema("s", "jsonschema", b"{}"))
+        for sequence, time in enumerate(times):
+            writer.add_message(channel, time, json.dumps({"n": sequence}).encode(), time, sequence)
+        writer.finish()
+    return path
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_encoding_gives_back_the_vectors_and_times_written(tmp_path: Path, encoding: Encoding) -> None:
+    log = write_mcap(tmp_path / "run.mcap", encoding=encoding, jitter_s=0.004)
+    messages = read(log.path, [JOINT_TOPIC])
+    assert np.array_equal(np.stack([decode_vector(m) for m in messages]), log.joints)
+    assert [m.log_time_ns for m in messages] == (log.joint_times_ns + HEADER_LAG_NS).tolist()
+    assert [m.publish_time_ns for m in messages] == (log.joint_times_ns + HEADER_LAG_NS // 2).tolist()
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_every_compression_is_read(tmp_path: Path, compression: CompressionType) -> None:
+    log = write_mcap(tmp_path / "run.mcap", compression=compression)
+    assert len(read(log.path, [JOINT_TOPIC])) == len(log.joints)
+
+
+def test_topics_carry_schema_encoding_and_count_sorted_by_name(tmp_path: Path) -> None:
+    with open_log(write_mcap(tmp_path / "run.mcap", cameras=("front", "side"), n_frames=6).path) as log:
+        topics = log.topics()
+    assert [t.name for t in topics] == [ACTION_TOPIC, image_topic("front"), image_topic("side"), JOINT_TOPIC]
+    assert (topics[1].schema, topics[1].encoding, topics[1].message_count) == (
+        "sensor_msgs/msg/CompressedImage",
+        "cdr",
+        6,
+    )
+
+
+def test_only_the_topics_asked_for_are_read(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    assert {m.topic for m in read(log.path, [ACTION_TOPIC, JOINT_TOPIC])} == {ACTION_TOPIC, JOINT_TOPIC}
+
+
+def test_time_range_includes_its_start_and_excludes_its_end(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [10, 20, 30, 40], chunk_size=60)
+    assert [m.log_time_ns for m in read(path, start_ns=20, end_ns=40)] == [20, 30]
+    assert [m.log_time_ns for m in read(path, start_ns=21)] == [30, 40]
+    assert read(path, start_ns=41) == []
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE},
+        {"use_statistics": False},
+        {"repeat_channels": False},
+    ],
+)
+def test_messages_come_in_order_of_log_time_however_they_were_written_and_indexed(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    times = random.Random(0).sample(range(1000), 200)
+    path = write_json(tmp_path / "run.mcap", times, chunk_size=200, **options)
+    messages = read(path)
+    assert [m.log_time_ns for m in messages] == sorted(times)
+    assert [times[m.body["n"]] for m in messages] == sorted(times)
+    with open_log(path) as log:
+        assert log.topics()[0].message_count == 200
+        assert (log.episodes()[0].start_ns, log.episodes()[0].end_ns) == (min(times), max(times) + 1)
+
+
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_messages_of_one_time_keep_the_order_of_the_file(tmp_path: Path, use_chunking: bool) -> None:
+    path = write_json(tmp_path / "run.mcap", [5] * 100, chunk_size=200, use_chunking=use_chunking)
+    assert [m.body["n"] for m in read(path)] == list(range(100))
+
+
+def test_an_unknown_topic_is_refused_with_the_nearest_one(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    with pytest.raises(LogError, match="did you mean '/joint_states'"):
+        read(log.path, ["/joint_state"])
+
+
+def test_the_file_is_one_episode_named_after_it_with_its_tags(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "take_07.mcap", tags={"success": "true", "seed": "7"})
+    with open_log(log.path) as reader:
+        (episode,) = reader.episodes()
+        assert reader.metadata() == {"episode": {"success": "true", "seed": "7"}}
+    assert (episode.name, episode.tags) == ("take_07", {"success": "true", "seed": "7"})
+    assert episode.start_ns == START_NS + HEADER_LAG_NS
+    assert len(read(log.path, start_ns=episode.start_ns, end_ns=episode.end_ns)) == len(read(log.path))
+
+
+def test_a_log_without_messages_has_no_episode(tmp_path: Path) -> None:
+    with open_log(write_json(tmp_path / "run.mcap", [])) as log:
+        assert log.episodes() == []
+        assert list(log.messages([])) == []
+
+
+def test_sha256_is_that_of_the_file(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", enable_data_crcs=True)
+    with open_log(log.path) as reader:
+        assert reader.sha256() == hashlib.sha256(log.path.read_bytes()).hexdigest()
+
+
+# --- damage -----------------------------------------------------------------------------------------------------------
+
+
+def contents(messages: list[Message]) -> list[tuple[str, int, int, str]]:
+    return [(m.topic, m.log_time_ns, m.publish_time_ns, json.dumps(m.body)) for m in messages]
+
+
+def damaged_copies(path: Path, content: bytes, changes: list[tuple[int, int]]) -> Iterator[Path]:
+    for position, bits in changes:
+        changed = bytearray(content)
+        changed[position] ^= bits
+        path.write_bytes(changed)
+        yield path
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": CompressionType.NONE}, {"compression": CompressionType.LZ4}])
+def test_a_flipped_byte_gives_an_error_or_the_exact_messages(tmp_path: Path, options: dict[str, Any]) -> None:
+    log = write_mcap(
+        tmp_path / "run.mcap",
+        encoding="json",
+        n_frames=3,
+        height=16,
+        width=16,
+        chunk_size=2000,
+        tags={"a": "b"},
+        **options,
+    )
+    content, expected = log.path.read_bytes(), contents(read(log.path))
+    rng = random.Random(1)
+    positions = rng.sample(range(len(content)), 150) + list(range(len(content) - 120, len(content)))
+    caught = 0
+    for path in damaged_copies(tmp_path / "flipped.mcap", content, [(p, 1 << rng.randrange(8)) for p in positions]):
+        try:
+            assert contents(read(path)) == expected
+        except LogError as error:
+            caught += 1
+            assert error.remedy
+            assert str(path) in str(error)
+    assert caught > len(positions) // 2
+
+
+def test_a_flipped_byte_in_a_chunk_names_the_file_and_the_way_out(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", compression=CompressionType.NONE)
+    content = log.path.read_bytes()
+    where = content.index(b"shoulder", len(content) // 3)
+    (path,) = damaged_copies(tmp_path / "flipped.mcap", content, [(where, 4)])
+    with pytest.raises(
+        LogError, match=r"flipped\.mcap: the log is damaged at the chunk at byte .*\n.*CRC(.|\n)*mcap recover"
+    ):
+        read(path)
+
+
+@pytest.mark.parametrize("options", [{"use_chunking": False}, {"index_types": IndexType.NONE}])
+def test_without_an_index_a_flipped_byte_is_caught_by_the_data_checksum(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    path = write_json(
+        tmp_path / "run.mcap", list(range(50)), enable_data_crcs=True, compression=CompressionType.NONE, **options
+    )
+    content = path.read_bytes()
+    (flipped,) = damaged_copies(tmp_path / "flipped.mcap", content, [(content.index(b'{"n": 30}') + 6, 1)])
+    with pytest.raises(LogError, match="CRC"):
+        read(flipped)
+
+
+def test_hashing_checks_the_data_checksum_that_reading_by_index_skips(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", enable_data_crcs=True, tags={"object": "cube"})
+    content = log.path.read_bytes()
+    (flipped,) = damaged_copies(tmp_path / "flipped.mcap", content, [(content.index(b"cube"), 1)])
+    with open_log(flipped) as reader, pytest.raises(LogError, match="the data section"):
+        reader.sha256()
+
+
+def test_every_cut_off_file_says_how_much_is_intact(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", chunk_size=4000)
+    content = log.path.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for size in [*range(1, 60), *range(60, len(content), 331), *range(len(content) - 40, len(content))]:
+        cut.write_bytes(content[:size])
+        with pytest.raises(LogError, match="cut off") as caught:
+            open_log(cut)
+        assert caught.value.remedy
+    assert "chunks" in str(caught.value.found)
+
+
+@pytest.mark.parametrize("use_statistics", [True, False])
+def test_messages_between_indexed_chunks_are_read_too(tmp_path: Path, use_statistics: bool) -> None:
+    """Chunks and loose messages may be mixed; a reader that trusts the chunk index alone drops the loose ones in silence."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=100, use_statistics=use_statistics)
+        writer.start("", "test")
+        channel = writer.register_channel("/t", "json", 0)
+        for time in range(20):
+            chunks = writer._Writer__chunk_builder  # type: ignore[attr-defined]
+            if time in (7, 13):
+                writer._Writer__chunk_builder = None  # type: ignore[attr-defined]
+            writer.add_message(channel, time, b"{}", time)
+            writer._Writer__chunk_builder = chunks  # type: ignore[attr-defined]
+        writer.finish()
+    assert [m.log_time_ns for m in read(path)] == list(range(20))
+    with open_log(path) as log:
+        assert log.topics()[0].message_count == 20
+
+
+def test_fewer_messages_than_the_statistics_count_are_an_error(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [10, 20, 30], enable_crcs=False)
+    content = path.read_bytes()
+    for three, four in (
+        (struct.pack("<QH", 3, 1), struct.pack("<QH", 4, 1)),
+        (struct.pack("<HQ", 1, 3), struct.pack("<HQ", 1, 4)),
+    ):
+        place = content.rindex(three)  # the statistics record: total, then this channel's count
+        content = content[:place] + four + content[place + len(three) :]
+    path.write_bytes(content)
+    with pytest.raises(LogError, match="3 messages where the file's own index counts 4"):
+        read(path)
+
+
+def test_bytes_that_do_not_fit_their_schema_name_topic_and_time(tmp_path: Path) -> None:
+    def broken(writer: Writer) -> None:
+        writer.add_message(writer.register_channel("/bad", "json", 0), 77, b"{not json", 77)
+
+    path = write_json(tmp_path / "run.mcap", [1], before=broken)
+    assert len(read(path, ["/t"])) == 1
+    with pytest.raises(LogError, match="a message of /bad at 77 ns does not fit its schema"):
+        read(path, ["/bad"])
+
+
+# --- real logs --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "relative",
+    [
+        "logs/rosbags_rs_testbags/tests/test_bags/test_bag_mcap/test_bag_mcap.mcap",
+        "logs/rosbag2_tests/rosbag2_tests/resources/mcap/cdr_test/cdr_test_0.mcap",
+        "logs/rosbag2_tests/rosbag2_py/test/resources/mcap/talker/talker.mcap",
+        "logs/rosbag2_tests/rosbag2_py/test/resources/mcap/convert_a/rewriter_a_0.mcap",
+        "logs/keelson/test.e50a33.mcap",
+        "logs/lichtblick/e2e_fixtures_assets_custom-camera-model.mcap",
+        "logs/lichtblick/e2e_fixtures_assets_example_logs.mcap",
+    ],
+)
+def test_real_logs_are_decoded_whole_and_in_the_order_of_the_mcap_library(relative: str) -> None:
+    path = real_data(relative)
+    ours = [(m.topic, m.log_time_ns, m.publish_time_ns) for m in read(path)]
+    with path.open("rb") as stream:
+        theirs = [(c.topic, m.log_time, m.publish_time) for _, c, m in make_reader(stream).iter_messages()]
+    assert ours == theirs
+
+
+def test_real_log_without_statistics_counts_its_messages() -> None:
+    with open_log(real_data("logs/rosbags_rs_testbags/tests/test_bags/test_bag_mcap/test_bag_mcap.mcap")) as log:
+        topics = log.topics()
+    assert len(topics) == 94
+    assert {t.message_count for t in topics} == {2}
+
+
+def test_wrong_serialisation_is_refused_only_when_asked_for() -> None:
+    with open_log(
+        real_data("logs/rosbag2_tests/rosbag2_tests/resources/mcap/wrong_rmw_test/wrong_rmw_test_0.mcap")
+    ) as log:
+        assert len(log.topics()) == 2
+        with pytest.raises(LogError, match="wrong_format") as caught:
+            log.messages(["/test_topic"])
+    assert "/test_topic" in str(caught.value)
+
+
+def test_a_service_schema_is_refused_only_when_asked_for() -> None:
+    path = real_data("logs/rosbag2_tests/rosbag2_cpp/test/rosbag2_cpp/bags/topics_and_services.mcap")
+    assert len(read(path, ["/parameter_events"])) == 7
+    with pytest.raises(LogError, match="schema cannot be understood"):
+        read(path, ["/add_two_ints/_service_event"])

@@ -1,0 +1,66 @@
+"""`open_log` tells formats by content, and says what to do about everything that is no log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.real_data import real_data
+from tests.synthetic import write_mcap, write_zarr
+from vilp_data.errors import LogError, UsageError
+from vilp_data.sources import open_log
+
+
+def test_format_is_told_by_content_whatever_the_suffix(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.bin")
+    store = write_zarr(tmp_path / "demonstrations")
+    with open_log(log.path) as one, open_log(store.path) as other:
+        assert (one.format, other.format) == ("mcap", "zarr")
+
+
+def test_missing_path_is_wrong_use(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such log"):
+        open_log(tmp_path / "absent.mcap")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "the log is empty"),
+        (b"hello world, not a log", "not a log"),
+        (b"\x89MCAP", "cut off inside its first mark"),
+        (b"\x89MCAP0\n\x01\x19", "line endings converted"),
+        (b"#ROSBAG V2.0\n....", "ROS 1 bag log: not read yet"),
+        (b"SQLite format 3\0....", "db3\\) log: not read yet"),
+        (b"\x89HDF\r\n\x1a\n....", "HDF5 log: not read yet"),
+    ],
+)
+def test_what_is_no_readable_log_is_named_with_a_remedy(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=says) as caught:
+        open_log(path)
+    assert str(path) in str(caught.value)
+    assert caught.value.remedy
+
+
+def test_a_folder_that_is_no_zarr_store_shows_what_is_inside(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "a.mcap").touch()
+    with pytest.raises(LogError, match=r"a\.mcap"):
+        open_log(tmp_path / "logs")
+
+
+def test_real_file_mangled_by_line_ending_conversion_is_recognised() -> None:
+    with pytest.raises(LogError, match="binary"):
+        open_log(real_data("logs/keelson/connectors_klog_bin_2024-05-15.mcap"))
+
+
+def test_real_bag_and_db3_are_recognised_but_not_read() -> None:
+    for path in (
+        "logs/lichtblick/e2e_fixtures_assets_example-bag.bag",
+        "logs/rosbag2_tests/rosbag2_cpp/test/rosbag2_cpp/bags/topics_and_services.db3",
+    ):
+        with pytest.raises(LogError, match="not read yet"):
+            open_log(real_data(path))

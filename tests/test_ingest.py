@@ -1,0 +1,298 @@
+"""Logs into the store: what is taken, what is refused and in which words, what is never lost."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import synthetic
+from tests.faults import kill_moments, run_until_killed, tree
+from tests.synthetic import task_spec, write_mcap, write_zarr, zarr_task_spec
+from vilp_data import shards
+from vilp_data.episodes import EpisodeStore
+from vilp_data.errors import BusyError, StoreError, UsageError
+from vilp_data.ingest import IngestReport, ingest_logs
+from vilp_data.spec import TaskSpec
+from vilp_data.staleness import stale_episodes
+from vilp_data.types import Episode
+
+
+def ingest(logs: list[Path], root: Path, spec: TaskSpec, *, include_failures: bool = False) -> IngestReport:
+    return ingest_logs(logs, root, spec, workers=1, include_failures=include_failures)
+
+
+def only_episode(root: Path) -> Episode:
+    store = EpisodeStore(root)
+    (entry,) = store.index()
+    return store.read(entry.id)
+
+
+@pytest.mark.parametrize("codec", ["png", "raw"])
+@pytest.mark.parametrize("encoding", ["cdr", "protobuf", "json"])
+def test_every_encoding_gives_the_frames_and_vectors_that_were_recorded(
+    tmp_path: Path, encoding: str, codec: str
+) -> None:
+    log = write_mcap(tmp_path / "run.mcap", encoding=encoding, image_codec=codec, cameras=("front", "side"))  # type: ignore[arg-type]
+    ingest([log.path], tmp_path / "data", task_spec(log))
+    episode = only_episode(tmp_path / "data")
+    assert episode.n_steps == 20
+    assert episode.valid.all()
+    for camera, frames in log.frames.items():
+        np.testing.assert_array_equal(episode.frames[camera][episode.source_index[camera]], frames)
+    np.testing.assert_allclose(episode.low_dim[:, 0], np.arange(20) / 10, atol=1e-6)
+    assert episode.action is not None
+    np.testing.assert_allclose(episode.action, [synthetic.action_at(k / 10) for k in range(20)], atol=1e-6)
+
+
+def test_a_step_off_in_time_would_be_seen(tmp_path: Path) -> None:
+    """The same log read with its clock shifted by one tick must not give the same frames and vectors."""
+    log = write_mcap(tmp_path / "run.mcap", image_codec="png")
+    spec = task_spec(log).model_dump(by_alias=True)
+    spec["views"]["front"]["offset_s"] = 0.1
+    ingest([log.path], tmp_path / "data", TaskSpec.model_validate(spec))
+    shifted = only_episode(tmp_path / "data")
+    true_low_dim = np.array([synthetic.joints_at(k / 10) for k in range(shifted.n_steps)], np.float32)
+    assert np.abs(shifted.low_dim - true_low_dim).max() > 0.05
+
+
+def test_jpeg_frames_keep_the_colour_card(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", image_codec="jpeg")
+    ingest([log.path], tmp_path / "data", task_spec(log))
+    stored, true = only_episode(tmp_path / "data").frames["front"], log.frames["front"]
+    assert synthetic.psnr(stored, true) > 32
+    for wrong in (stored[..., ::-1], stored[:, ::-1], stored[:, :, ::-1], np.roll(stored, 1, axis=0)):
+        assert synthetic.psnr(wrong, true) < 32
+
+
+def test_a_zarr_store_gives_one_episode_for_each_end(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "replay.zarr")
+    report = ingest([log.path], tmp_path / "data", zarr_task_spec())
+    assert report.written == ["replay-episode_000", "replay-episode_001", "replay-episode_002"]
+    store, first = EpisodeStore(tmp_path / "data"), 0
+    for entry, end in zip(store.index(), log.episode_ends, strict=True):
+        episode = store.read(entry.id)
+        np.testing.assert_array_equal(episode.frames["top"], log.img[first:end])
+        np.testing.assert_array_equal(episode.low_dim, log.state[first:end, :2].astype(np.float32))
+        np.testing.assert_array_equal(episode.action, log.action[first:end].astype(np.float32))
+        first = int(end)
+
+
+def test_an_episode_may_lack_actions(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", with_actions=False)
+    spec = task_spec(log, action={"target": {"topic": synthetic.ACTION_TOPIC}})
+    ingest([log.path], tmp_path / "data", spec)
+    assert only_episode(tmp_path / "data").action is None
+
+
+def test_actions_can_be_taken_from_the_state_some_steps_ahead(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", with_actions=False)
+    ingest([log.path], tmp_path / "data", task_spec(log, action={"target": {"from": "joints", "shift": 2}}))
+    episode = only_episode(tmp_path / "data")
+    assert episode.action is not None
+    np.testing.assert_array_equal(episode.action[:-2], episode.low_dim[2:])
+
+
+def test_a_second_run_does_nothing_and_a_changed_spec_says_which_field(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    spec, root = task_spec(log), tmp_path / "data"
+    ingest([log.path], root, spec)
+    before = tree(root)
+    report = ingest([log.path], root, spec)
+    assert (report.written, report.fresh) == ([], ["run"])
+    assert tree(root) == before
+    smaller = spec.model_dump(by_alias=True)
+    smaller["views"]["front"] |= {"height": 24, "width": 32}
+    changed = TaskSpec.model_validate(smaller)
+    assert "views.front.height: 48 -> 24" in stale_episodes(root, changed)["run"]
+    assert ingest([log.path], root, changed).written == ["run"]
+    assert only_episode(root).frames["front"].shape[1:] == (24, 32, 3)
+
+
+def test_a_copy_of_a_log_under_another_name_is_known_by_its_content(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    (tmp_path / "copy.mcap").write_bytes(log.path.read_bytes())
+    report = ingest([log.path, tmp_path / "copy.mcap"], tmp_path / "data", task_spec(log))
+    assert report.written == ["run"]
+
+
+def test_two_logs_of_the_same_name_are_two_episodes(tmp_path: Path) -> None:
+    for folder, seed in (("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        log = write_mcap(tmp_path / folder / "run.mcap", jitter_s=0.001, seed=seed)
+    report = ingest([tmp_path / "a", tmp_path / "b"], tmp_path / "data", task_spec(log))
+    assert len(report.written) == 2
+
+
+def test_failures_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", tags={"success": "false", "seed": "7"})
+    spec = task_spec(log)
+    assert ingest([log.path], tmp_path / "data", spec).left_out == ["run"]
+    assert ingest([log.path], tmp_path / "data", spec, include_failures=True).written == ["run"]
+    episode = only_episode(tmp_path / "data")
+    assert (episode.outcome, episode.tags["seed"]) == ("failure", "7")
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------------
+
+
+def test_logs_that_cannot_be_read_are_named_and_keep_no_other_back(tmp_path: Path) -> None:
+    good = write_mcap(tmp_path / "good.mcap")
+    whole = good.path.read_bytes()
+    bad = {
+        "empty.mcap": b"",
+        "text.mcap": b"not a log at all, but long enough to look",
+        "cut.mcap": whole[: len(whole) * 2 // 3],
+        "flipped.mcap": whole[:3000] + bytes([whole[3000] ^ 1]) + whole[3001:],
+    }
+    for name, content in bad.items():
+        (tmp_path / name).write_bytes(content)
+    report = ingest([tmp_path], tmp_path / "data", task_spec(good))
+    assert report.written == ["good"]
+    assert len(report.failed) == len(bad)
+    for name in bad:
+        assert any(name in message and "->" in message for _, message in report.failed), name
+    assert [entry.id for entry in EpisodeStore(tmp_path / "data").index()] == ["good"]
+
+
+def test_a_missing_topic_names_the_nearest(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    spec = task_spec(log, views={"front": {"topic": "/camera/frnt/image", "height": 48, "width": 64}})
+    ((_, message),) = ingest([log.path], tmp_path / "data", spec).failed
+    assert "did you mean '/camera/front/image'" in message
+
+
+def test_another_aspect_ratio_is_refused_until_a_fit_is_stated(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    view = {"topic": "/camera/front/image", "height": 48, "width": 48}
+    ((_, message),) = ingest([log.path], tmp_path / "data", task_spec(log, views={"front": view})).failed
+    assert "fit = " in message
+    assert ingest([log.path], tmp_path / "data", task_spec(log, views={"front": view | {"fit": "crop"}})).written
+
+
+def test_an_episode_of_one_step_is_refused(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", n_frames=1)
+    ((_, message),) = ingest([log.path], tmp_path / "data", task_spec(log)).failed
+    assert "one step" in message
+
+
+def test_commands_that_are_no_numbers_mask_their_steps_and_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(synthetic, "action_at", lambda t: [float("nan") if 0.45 < t < 0.75 else t, 0.0])
+    log = write_mcap(tmp_path / "run.mcap")
+    report = ingest([log.path], tmp_path / "data", task_spec(log))
+    episode = only_episode(tmp_path / "data")
+    assert np.flatnonzero(~episode.valid).tolist() == [5, 6, 7]
+    assert episode.action is not None
+    assert np.isfinite(episode.action).all()
+    assert "action: missing, stale or not finite at 3 of 20 steps, first at step 5" in report.findings["run"][0]
+
+
+def test_a_sensor_that_stops_masks_what_it_can_no_longer_tell(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", joint_hz=1.0)
+    spec = task_spec(log).model_dump(by_alias=True)
+    spec["low_dim"]["joints"]["stale_after_s"] = 0.55
+    ingest([log.path], tmp_path / "data", TaskSpec.model_validate(spec))
+    assert (~only_episode(tmp_path / "data").valid).sum() == 8  # ages 0.6 to 0.9 s, twice
+
+
+def test_planned_frames_closer_than_the_camera_are_refused(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", camera_hz=2.0)
+    spec = task_spec(log, window={"frame_stride": 2}, rate_hz=10.0)
+    ((_, message),) = ingest([log.path], tmp_path / "data", spec).failed
+    assert "frame_stride" in message
+
+
+def test_the_rate_is_the_slowest_camera_s_where_none_is_stated(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap", camera_hz=20.0)
+    ingest([log.path], tmp_path / "data", task_spec(log, rate_hz=None))
+    assert only_episode(tmp_path / "data").rate_hz == pytest.approx(20.0)
+
+
+def test_a_wrong_path_and_an_empty_folder_are_wrong_use(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such file"):
+        ingest([tmp_path / "nowhere"], tmp_path / "data", zarr_task_spec())
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError, match="no logs in this folder"):
+        ingest([tmp_path / "empty"], tmp_path / "data", zarr_task_spec())
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_folder_without_write_permission_is_said(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    (tmp_path / "data").mkdir(mode=0o500)
+    with pytest.raises(StoreError, match="permission"):
+        ingest([log.path], tmp_path / "data", task_spec(log))
+
+
+def test_a_data_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    (tmp_path / "data").write_text("a file is in the way")
+    with pytest.raises(StoreError, match="cannot be written"):
+        ingest([log.path], tmp_path / "data", task_spec(log))
+
+
+def test_ingest_while_another_process_writes_is_refused(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    with shards.writer_lock(tmp_path / "data"), pytest.raises(BusyError):
+        ingest([log.path], tmp_path / "data", task_spec(log))
+
+
+# --- the store -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_or_damaged_index_is_rebuilt_from_the_headers(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "replay.zarr")
+    ingest([log.path], tmp_path / "data", zarr_task_spec())
+    store = EpisodeStore(tmp_path / "data")
+    entries = store.index()
+    store.index_path.write_bytes(b"PAR1 damaged PAR1")
+    assert store.index() == entries
+    store.index_path.unlink()
+    assert store.index() == entries
+    store.steps_path(entries[0].id).unlink()
+    assert store.index() == entries[1:]
+
+
+def test_frames_of_another_ingest_are_noticed(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "replay.zarr")
+    ingest([log.path], tmp_path / "data", zarr_task_spec())
+    store = EpisodeStore(tmp_path / "data")
+    one, two = store.index()[:2]
+    store.frames_path("top", one.id).write_bytes(store.frames_path("top", two.id).read_bytes())
+    with pytest.raises(StoreError, match="not the frames"):
+        store.read(one.id)
+
+
+def test_a_dataset_of_another_format_version_is_refused(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "replay.zarr")
+    ingest([log.path], tmp_path / "data", zarr_task_spec())
+    path = tmp_path / "data" / "dataset.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 99}))
+    with pytest.raises(StoreError, match="another version"):
+        EpisodeStore(tmp_path / "data").spec()
+
+
+# --- killed at any moment ------------------------------------------------------------------------------------------------
+
+INGEST = """
+import sys
+from pathlib import Path
+from tests.synthetic import zarr_task_spec
+from vilp_data.ingest import ingest_logs
+ingest_logs([Path(sys.argv[1])], Path(sys.argv[2]), zarr_task_spec(), workers=1)
+"""
+
+
+@pytest.mark.parametrize("nth", kill_moments(few=4, many=44))
+def test_ingest_killed_at_any_moment_and_run_again_gives_the_same_bytes(tmp_path: Path, nth: int) -> None:
+    log = write_zarr(tmp_path / "replay.zarr", episode_lengths=(12, 9, 5, 14))
+    killed = run_until_killed(INGEST, [str(log.path), str(tmp_path / "killed")], nth=nth)
+    assert killed or nth > 30
+    ingest([log.path], tmp_path / "killed", zarr_task_spec())
+    ingest([log.path], tmp_path / "whole", zarr_task_spec())
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")

@@ -1,0 +1,107 @@
+"""The split of a dataset folder: split.lock.json read, drawn from the stored episodes, written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from vilp_data import shards
+from vilp_data.duplicates import thumbnails
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
+from vilp_data.errors import SplitError
+from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
+from vilp_data.split_lock import SplitLock
+
+
+def lock_path(root: Path) -> Path:
+    return root / "split.lock.json"
+
+
+def read_split(root: Path) -> SplitLock:
+    """The dataset's split. Raises SplitError where none was drawn, or the lock was changed by hand."""
+    lock = find_split(root)
+    if lock is None:
+        raise SplitError("this dataset has no split yet", where=root, remedy=f"run `vilp-data split {root}`")
+    if not lock.is_intact:
+        raise SplitError(
+            "the assignment does not match its recorded hash: it was changed by hand",
+            where=lock_path(root),
+            remedy="put the file back as it was, or `vilp-data split --redraw` (trained models then no longer fit it)",
+        )
+    return lock
+
+
+def find_split(root: Path) -> SplitLock | None:
+    path = lock_path(root)
+    return SplitLock.from_json(path.read_bytes(), where=path) if path.is_file() else None
+
+
+def update_split(
+    root: Path,
+    *,
+    ratio: float,
+    ratio_from: RatioOrigin,
+    seed: int,
+    group_by: str | None,
+    strata: tuple[str, ...],
+    redraw: bool,
+) -> SplitLock:
+    """Draw or extend the split over all stored episodes and write it where it changed. Raises as `split.draw_split` does."""
+    with shards.writer_lock(root):
+        previous = find_split(root)
+        if previous is not None and not redraw:
+            previous = read_split(root)
+        lock = draw_split(
+            list(split_episodes(EpisodeStore(root), group_by, strata)),
+            ratio=ratio,
+            seed=seed,
+            ratio_from=ratio_from,
+            group_by=group_by,
+            strata=strata,
+            previous=previous,
+            redraw=redraw,
+        )
+        data = lock.to_json()
+        path = lock_path(root)
+        if not path.is_file() or path.read_bytes() != data:
+            shards.write_atomic(path, data)
+    return lock
+
+
+def check_dataset_split(root: Path) -> list[str]:
+    """What is wrong with the dataset's split, one sentence each."""
+    lock = find_split(root)
+    if lock is None:
+        return ["no split yet: run `vilp-data split`"]
+    return check_split(lock, list(split_episodes(EpisodeStore(root), lock.group_by, lock.strata)))
+
+
+def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str, ...]) -> Iterator[SplitEpisode]:
+    """What the split needs to know of each stored episode."""
+    for entry in store.index():
+        for tag in (*strata, *([group_by] if group_by else [])):
+            if tag not in entry.tags:
+                raise SplitError(
+                    f"no tag {tag!r}, which the split groups or spreads by",
+                    where=entry.id,
+                    found=f"tags {', '.join(sorted(entry.tags)) or '(none)'}",
+                    remedy="name another tag in [split], or record it in every log",
+                )
+        yield SplitEpisode(
+            id=entry.id,
+            content_hash=entry.content_sha256,
+            group=entry.tags[group_by] if group_by else None,
+            strata=tuple(entry.tags[tag] for tag in strata),
+            thumbnails=_thumbnails(store, entry),
+        )
+
+
+def _thumbnails(store: EpisodeStore, entry: EpisodeEntry) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    """The first, middle and last frame of every view, small and grey: float32 [3V,8,8]."""
+    rows = []
+    for view in sorted(entry.frames_sha256):
+        frames = shards.open_shard(store.frames_path(view, entry.id)).arrays["frames"]
+        rows.append(thumbnails(frames))
+    return np.concatenate(rows)

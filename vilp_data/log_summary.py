@@ -1,0 +1,239 @@
+"""What a log holds, told quickly: topics, rates, gaps, image sizes, clocks. Reads the index and a few early messages, never all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_image
+from vilp_data.errors import VilpDataError
+from vilp_data.sources import IndexedLog, open_log
+from vilp_data.types import I64, Message, TopicInfo
+
+GLANCE = 20  # messages of a topic that are decoded
+EARLIEST_WALL_NS = (
+    946_684_800 * 1_000_000_000
+)  # the year 2000: earlier stamps are simulated time, or a clock that was never set
+FAR_APART_S = 1.0  # a header this far from the log time is worth a word
+SHOWN_METADATA = 60  # characters of a metadata value in the terminal
+CLOCKS = {"wall": "wall clock", "simulated": "simulated clock", "none": "row count over rate"}
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """One topic. Figures that nothing tells are None: `note` then says why.
+
+    n_messages      from the log's statistics
+    rate_hz         1 / median interval of log times; max_gap_s the longest interval, backward_jumps how often log time fell
+    image           `96x160 jpeg` for image topics, from the first image
+    header_clock    "none", "wall", "simulated" (starting before the year 2000) or "zero" (stamps left unset)
+    header_lag_s    median of log time minus header stamp over the first messages; positive where the recorder came later
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    n_messages: int | None
+    rate_hz: float | None
+    max_gap_s: float | None
+    backward_jumps: int | None
+    image: str | None
+    header_clock: str | None
+    header_lag_s: float | None
+    note: str | None
+
+
+@dataclass(frozen=True)
+class LogSummary:
+    """A whole log. `sampled` names the figures that rest on a part of it only.
+
+    log_clock       "wall", "simulated" (starting before the year 2000), or "none" for logs whose rows carry no time
+    """
+
+    path: str
+    format: str
+    size_bytes: int
+    n_episodes: int
+    start_ns: int | None
+    duration_s: float
+    log_clock: str
+    topics: tuple[TopicSummary, ...]
+    metadata: dict[str, dict[str, str]]
+    sampled: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, ready for JSON."""
+        return asdict(self)
+
+
+def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
+    """Look at a log. Raises what `open_log` raises; a topic that cannot be read is not an error but gets a note."""
+    with open_log(path, array_rate_hz=array_rate_hz) as log:
+        times, complete = log.message_times()
+        episodes = log.episodes()
+        topics = tuple(_topic(log, topic, times.get(topic.name)) for topic in log.topics())
+        start_ns = episodes[0].start_ns if episodes else None
+        duration_s = (episodes[-1].end_ns - episodes[0].start_ns) / 1e9 if episodes else 0.0
+        return LogSummary(
+            path=str(path),
+            format=log.format,
+            size_bytes=_size(path),
+            n_episodes=len(episodes),
+            start_ns=start_ns,
+            duration_s=duration_s,
+            log_clock="none" if start_ns is None or log.format == "zarr" else _clock_kind(start_ns),
+            topics=topics,
+            metadata=log.metadata(),
+            sampled=_sampled(complete, times, start_ns),
+        )
+
+
+def _sampled(complete: bool, times: dict[str, I64], start_ns: int | None) -> tuple[str, ...]:
+    glance = f"image and header columns: the first {GLANCE} messages of each topic at most"
+    if complete or start_ns is None:
+        return (glance,)
+    covered_s = (max(int(values.max()) for values in times.values() if len(values)) - start_ns) / 1e9
+    return (f"rates and gaps: the first {covered_s:.0f} s", glance)
+
+
+def _topic(log: IndexedLog, topic: TopicInfo, times: I64 | None) -> TopicSummary:
+    rate_hz, max_gap_s, jumps = _intervals(times)
+    image = clock = lag_s = note = None
+    if times is None and topic.message_count:
+        note = "no message index: rate not known without reading the log"
+    if topic.message_count != 0:
+        try:
+            messages = log.first_messages(topic.name, GLANCE)
+            clock, lag_s = _header_clock(messages)
+            image = _image(messages)
+        except VilpDataError as error:
+            note = f"{error.what}: {error.found}" if error.found else error.what
+    return TopicSummary(
+        name=topic.name,
+        schema=topic.schema,
+        encoding=topic.encoding,
+        n_messages=topic.message_count,
+        rate_hz=rate_hz,
+        max_gap_s=max_gap_s,
+        backward_jumps=jumps,
+        image=image,
+        header_clock=clock,
+        header_lag_s=lag_s,
+        note=note,
+    )
+
+
+def _intervals(times: I64 | None) -> tuple[float | None, float | None, int | None]:
+    """(rate, longest gap, backward jumps) of log times in file order; no rate below two messages."""
+    if times is None or len(times) < 2:
+        return None, None, None if times is None else 0
+    jumps = int((np.diff(times) < 0).sum())
+    gaps_s = np.diff(np.sort(times)) / 1e9
+    median_s = float(np.median(gaps_s))
+    return 1 / median_s if median_s > 0 else None, float(gaps_s.max()), jumps
+
+
+def _image(messages: list[Message]) -> str | None:
+    if not messages or not is_image(messages[0]):
+        return None
+    height, width, _ = decode_image(messages[0]).shape
+    return f"{height}x{width} {image_encoding(messages[0])}"
+
+
+def _header_clock(messages: list[Message]) -> tuple[str | None, float | None]:
+    """(kind of header clock, median log time minus header time in s)."""
+    stamps = [(header, message.log_time_ns) for message in messages if (header := header_time_ns(message)) is not None]
+    if not stamps:
+        return ("none", None) if messages else (None, None)
+    if not any(header for header, _ in stamps):
+        return "zero", None
+    return _clock_kind(stamps[0][0]), float(np.median([log_time - header for header, log_time in stamps])) / 1e9
+
+
+def _clock_kind(time_ns: int) -> str:
+    return "wall" if time_ns >= EARLIEST_WALL_NS else "simulated"
+
+
+def _size(path: Path) -> int:
+    return (
+        sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.is_dir() else path.stat().st_size
+    )
+
+
+# --- for the terminal -----------------------------------------------------------------------------------------------
+
+
+def format_summary(summary: LogSummary) -> str:
+    """The summary as a table for the terminal, warnings about clocks below it."""
+    episodes = f"{summary.n_episodes} episode{'' if summary.n_episodes == 1 else 's'}"
+    start = "" if summary.start_ns is None else f", from {summary.start_ns} ns ({CLOCKS[summary.log_clock]})"
+    size = f"{summary.size_bytes / 1e6:.1f} MB"
+    lines = [f"{summary.path}: {summary.format}, {size}, {episodes}, {summary.duration_s:.2f} s{start}", ""]
+    head = ("topic", "schema", "encoding", "messages", "rate Hz", "max gap s", "image", "header clock", "lag s")
+    lines += _table([head, *(_row(topic) for topic in summary.topics)])
+    lines += _section("Worth knowing", _warnings(summary))
+    lines += _section("Metadata", _metadata_lines(summary.metadata))
+    lines += _section("From a sample", summary.sampled)
+    return "\n".join(lines)
+
+
+def _row(topic: TopicSummary) -> tuple[str, ...]:
+    return (
+        topic.name,
+        topic.schema,
+        topic.encoding,
+        "?" if topic.n_messages is None else str(topic.n_messages),
+        _number(topic.rate_hz, ".1f"),
+        _number(topic.max_gap_s, ".3f"),
+        topic.image or "",
+        topic.header_clock or "",
+        _number(topic.header_lag_s, ".3f"),
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+def _table(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _section(title: str, lines: Iterable[str]) -> list[str]:
+    body = [f"  {line}" for line in lines]
+    return ["", f"{title}:", *body] if body else []
+
+
+def _warnings(summary: LogSummary) -> list[str]:
+    lines = []
+    if summary.log_clock == "simulated":
+        lines.append("log time starts before the year 2000: simulated time, or a recorder whose clock was never set")
+    for topic in summary.topics:
+        if topic.note:
+            lines.append(f"{topic.name}: {topic.note}")
+        if topic.backward_jumps:
+            lines.append(
+                f"{topic.name}: log time falls {topic.backward_jumps} times; messages are read in order of log time"
+            )
+        if topic.header_clock == "zero":
+            lines.append(f'{topic.name}: header stamps are all zero; set clock = "log" for it')
+        if topic.header_clock == "simulated" and summary.log_clock == "wall":
+            lines.append(
+                f"{topic.name}: header stamps are simulated time, log time is wall time; do not mix them in one task"
+            )
+        elif topic.header_lag_s is not None and abs(topic.header_lag_s) > FAR_APART_S:
+            lines.append(f"{topic.name}: header stamps lie {topic.header_lag_s:.1f} s before log time; another clock?")
+    return lines
+
+
+def _metadata_lines(metadata: dict[str, dict[str, str]]) -> list[str]:
+    return [
+        f"{name}.{key} = {value[:SHOWN_METADATA]!r}{' …' if len(value) > SHOWN_METADATA else ''}"
+        for name, record in sorted(metadata.items())
+        for key, value in sorted(record.items())
+    ]

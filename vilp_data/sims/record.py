@@ -1,0 +1,177 @@
+"""Record demonstrations: the scripted expert of a task drives its environment, and each episode becomes one log.
+
+    t_k = t_0 + k / 10 Hz     cameras and joints measure, the simulator's state is taken, then action k is issued; all stamped t_k
+    t_k + 50 ms               joints, end effector and gripper measure again
+
+The last tick holds the final observation and the command to stand still, so every tick has both.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vilp_data.engine import map_unordered
+from vilp_data.errors import LogError, UsageError, nearest
+from vilp_data.recorder import EPISODE_RECORD, EpisodeRecorder
+from vilp_data.sources import open_log
+from vilp_data.spec import TaskSpec
+from vilp_data.types import F32
+
+if TYPE_CHECKING:
+    from vilp_data.sims.hanoi import HanoiEnv, Proprioception
+
+START_NS = 1_000_000_000  # simulated clocks begin at one second: some readers take a zero stamp for a missing one
+TICK_NS = 100_000_000
+BASE_FRAME = "base"
+RECORDABLE = ("vilp/Hanoi-v0",)
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """A finished log. `n_steps` counts the actions that were executed."""
+
+    path: Path
+    seed: int
+    success: bool
+    n_steps: int
+
+
+@dataclass(frozen=True)
+class _Job:
+    task: str
+    options: Mapping[str, Any]
+    path: Path
+    seed: int
+
+
+def record_task(
+    spec: TaskSpec, out_dir: Path, *, episodes: int, first_seed: int, workers: int = 1,
+    progress: Callable[[RecordedEpisode], None] | None = None,
+) -> list[RecordedEpisode]:  # fmt: skip
+    """Record one episode for each of `episodes` seeds from `first_seed` on, into `out_dir/<task>-seed0000007.mcap`.
+
+    A finished log of the same seed and options is kept; anything unfinished is made again. Failures of the expert are written too,
+    with success "false" in their metadata. `spec.sim.options` go to the environment. `progress` hears of each episode as it
+    is done, the kept ones first; the list returned is in order of seed.
+
+    Raises UsageError where the task has no scripted expert, the simulator is not installed, or a log in `out_dir` was made with
+    other options.
+    """
+    if spec.sim is None or spec.sim.env not in RECORDABLE:
+        env = "no [sim] table" if spec.sim is None else spec.sim.env
+        raise UsageError("there is no scripted expert for this task", where=spec.name, found=env, remedy=nearest(env, RECORDABLE))
+    options = spec.sim.options
+    jobs = [_Job(spec.name, options, _log_path(out_dir, spec.name, seed), seed) for seed in range(first_seed, first_seed + episodes)]
+    done = {job.seed: kept for job in jobs if (kept := _finished(job)) is not None}
+    todo = [job for job in jobs if job.seed not in done]
+    if progress is not None:
+        for kept in done.values():
+            progress(kept)
+    if todo:
+        require_simulator(cameras=bool(options.get("cameras", True)))
+    for job, episode in map_unordered(_record_one, todo, workers=workers):
+        done[job.seed] = episode
+        if progress is not None:
+            progress(episode)
+    return [done[job.seed] for job in jobs]
+
+
+def require_simulator(*, cameras: bool) -> None:
+    """UsageError with the one command that helps, where robosuite or the software renderer is missing."""
+    missing = [name for name in ("gymnasium", "mujoco", "robosuite") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError("the simulator is not installed", found=f"no package called {', '.join(missing)}", remedy="make setup")
+    renderer = os.environ.get("MUJOCO_GL", "osmesa")
+    if cameras and sys.platform.startswith("linux") and renderer == "osmesa" and ctypes.util.find_library("OSMesa") is None:
+        raise UsageError(
+            "the cameras cannot be drawn", found="no libOSMesa (MUJOCO_GL=osmesa)", remedy="sudo apt-get install -y libosmesa6"
+        )
+
+
+def _log_path(folder: Path, task: str, seed: int) -> Path:
+    return folder / f"{task}-seed{seed:07d}.mcap"
+
+
+def _finished(job: _Job) -> RecordedEpisode | None:
+    """The episode in a log that is already there and whole; UsageError where it was made with other options."""
+    if not job.path.exists():
+        return None
+    try:
+        with open_log(job.path) as log:
+            tags = log.metadata().get(EPISODE_RECORD, {})
+    except LogError:
+        return None
+    if tags.get("options") != _options_text(job):
+        raise UsageError(
+            "this log was recorded with other options", where=job.path, found=f"{tags.get('options')}, now {_options_text(job)}",
+            remedy="record into another folder, or move that log away",
+        )  # fmt: skip
+    return RecordedEpisode(job.path, job.seed, tags["success"] == "true", int(tags["n_steps"]))
+
+
+def _options_text(job: _Job) -> str:
+    return json.dumps(dict(job.options), sort_keys=True)
+
+
+def _record_one(job: _Job) -> RecordedEpisode:
+    """Runs in a worker process: the simulator is imported here."""
+    from vilp_data.sims.hanoi import HanoiEnv
+    from vilp_data.sims.hanoi_expert import HanoiExpert
+
+    env = HanoiEnv(**job.options)
+    try:
+        observation, info = env.reset(seed=job.seed)
+        expert = HanoiExpert(env)
+        with EpisodeRecorder(job.path, metadata=_tags(job, env), seed=job.seed) as log:
+            tick = 0
+            for action in expert.actions():
+                _write_tick(log, env, tick, observation, info, action)
+                observation, _, terminated, truncated, info = env.step(action)
+                tick += 1
+                if terminated or truncated:
+                    break
+            _write_tick(log, env, tick, observation, info, expert.hold())
+            log.metadata.update(success=str(info["is_success"]).lower(), n_steps=str(tick))
+    finally:
+        env.close()
+    return RecordedEpisode(job.path, job.seed, bool(info["is_success"]), tick)
+
+
+def _tags(job: _Job, env: HanoiEnv) -> dict[str, str]:
+    return {
+        "task": job.task,
+        "seed": str(job.seed),
+        "goal": f"peg{env.goal_peg}",
+        "object": "discs",
+        "n_discs": str(env.n_discs),
+        "base_angle": f"{env.base_angle:.6f}",
+        "policy": "scripted_expert",
+        "options": _options_text(job),
+        **{f"{name}_version": version(name) for name in ("vilp", "robosuite", "mujoco")},
+    }
+
+
+def _write_tick(log: EpisodeRecorder, env: HanoiEnv, tick: int, observation: Mapping[str, Any], info: Mapping[str, Any], action: F32) -> None:
+    stamp_ns = START_NS + tick * TICK_NS
+    for sample in info["proprioception"]:
+        _write_proprioception(log, env, START_NS + round(sample.time_s * 1e9), sample)
+    for view in (name for name in observation if name != "low_dim"):
+        log.image(f"/camera/{view}/image", stamp_ns, observation[view], frame_id=f"camera_{view}")
+    log.vector("/sim/state", stamp_ns, info["state"])
+    log.twist("/action/ee_delta", stamp_ns, action[:3], action[3:6], frame_id=BASE_FRAME)
+    log.joint_state("/action/gripper", stamp_ns, ["gripper"], action[6:])
+
+
+def _write_proprioception(log: EpisodeRecorder, env: HanoiEnv, stamp_ns: int, sample: Proprioception) -> None:
+    log.joint_state("/joint_states", stamp_ns, env.joint_names, sample.joint_position, sample.joint_velocity)
+    log.pose("/ee_pose", stamp_ns, sample.ee_position, sample.ee_quaternion, frame_id=BASE_FRAME)
+    log.joint_state("/gripper/state", stamp_ns, env.gripper_names, sample.gripper_position)

@@ -1,0 +1,274 @@
+"""What is in an MCAP file and where: from the summary that its writer left, or by reading the file once.
+
+The summary is believed only after its CRC, and only where it suffices to find every message; else the file is scanned, its
+data CRC checked on the way. Either way a reader gets the same `McapIndex`.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, MetadataIndex, Schema, Statistics
+
+from vilp_data.errors import LogError
+from vilp_data.sources.mcap_records import CHUNK_HEAD, MAGIC, MESSAGE_HEAD, RECORD_HEAD, RECOVER, RecordReader
+
+FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary_start, summary_offset_start, summary_crc
+TAIL_SIZE = FOOTER.size + len(MAGIC)
+DATA_END = struct.Struct("<BQI")  # opcode, length, data_section_crc
+
+
+class LooseMessage(NamedTuple):
+    """A message outside all chunks: where its record's content lies."""
+
+    log_time_ns: int
+    channel_id: int
+    offset: int
+    length: int
+
+
+@dataclass
+class McapIndex:
+    """Schemas and channels by id; chunks, loose messages (by log time) and metadata by place.
+
+    `counts` (channel id -> messages), and the log times of the first and the last message, are None where nothing tells them.
+    The data section ends at byte `data_end`; its CRC is 0 where none was written."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    loose: list[LooseMessage] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
+    statistics: Statistics | None = None
+    counts: Counter[int] | None = None
+    first_ns: int | None = None
+    last_ns: int | None = None
+    data_end: int = 0
+    data_crc: int = 0
+
+    def count(self, channel_id: int, log_time_ns: int) -> None:
+        """Note one message found by scanning."""
+        self.counts = Counter() if self.counts is None else self.counts
+        self.counts[channel_id] += 1
+        self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
+        self.last_ns = log_time_ns if self.last_ns is None else max(self.last_ns, log_time_ns)
+
+
+def read_index(reader: RecordReader) -> McapIndex:
+    """The index of a file; LogError where the file is cut off, or its summary is damaged."""
+    tail = b""
+    if reader.size >= len(MAGIC) + TAIL_SIZE:
+        tail = reader.bytes_at(reader.size - TAIL_SIZE, TAIL_SIZE, "the footer")
+    if not tail.endswith(MAGIC):
+        raise _cut_off(reader)
+    opcode, length, summary_start, _, crc = FOOTER.unpack_from(tail)
+    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - RECORD_HEAD.size):
+        raise reader.damaged("the footer", f"record {opcode:#04x} of {length} bytes")
+    footer_start = reader.size - TAIL_SIZE
+    if summary_start > footer_start:
+        raise reader.damaged("the footer", f"a summary at byte {summary_start}, past the footer at {footer_start}")
+    index = _from_summary(reader, summary_start, footer_start, crc) if summary_start else None
+    if index is None:
+        index = _from_scan(reader)
+    index.data_end, index.data_crc = _data_end(reader, summary_start or footer_start)
+    return index
+
+
+def _data_end(reader: RecordReader, after: int) -> tuple[int, int]:
+    """(offset, CRC) of the DataEnd record, which ends at byte `after`."""
+    offset = after - DATA_END.size
+    opcode, length, crc = DATA_END.unpack(reader.bytes_at(offset, DATA_END.size, "the end of the data section"))
+    return (offset, crc) if (opcode, length) == (Opcode.DATA_END, DATA_END.size - RECORD_HEAD.size) else (offset, 0)
+
+
+# --- from the summary -----------------------------------------------------------------------------------------------
+
+
+def _from_summary(reader: RecordReader, start: int, footer_start: int, crc: int) -> McapIndex | None:
+    """The index that the writer left, or None where it left none that suffices."""
+    section = reader.bytes_at(start, footer_start - start, "the summary")
+    footer = reader.bytes_at(footer_start, FOOTER.size - 4, "the footer")  # the CRC covers all but itself
+    if crc and zlib.crc32(footer, zlib.crc32(section)) != crc:
+        raise reader.damaged("the summary", "its checksum does not match")
+    index = McapIndex()
+    for opcode, begin, end in reader.records(section, "the summary"):
+        _add(index, reader, opcode, section[begin:end], "the summary")
+    if not _describes_channels(index) or not _reaches_all(index) or not _gaps_are_read(index, reader, start):
+        return None
+    statistics = index.statistics
+    if statistics is None:
+        index.counts = _counts_by_message_index(index, reader)
+        spans = [(chunk.message_start_time, chunk.message_end_time) for chunk in index.chunks]
+        index.first_ns, index.last_ns = min(first for first, _ in spans), max(last for _, last in spans)
+        for message in index.loose:
+            index.count(message.channel_id, message.log_time_ns)
+    elif statistics.message_count:
+        index.first_ns, index.last_ns = statistics.message_start_time, statistics.message_end_time
+        if sum(statistics.channel_message_counts.values()) == statistics.message_count:
+            index.counts = Counter(statistics.channel_message_counts)
+    else:
+        index.counts = Counter()
+    return index
+
+
+def _describes_channels(index: McapIndex) -> bool:
+    """Whether every channel that chunks speak of, and every schema that channels speak of, is in the summary."""
+    spoken_of = {channel_id for chunk in index.chunks for channel_id in chunk.message_index_offsets}
+    schema_ids = {channel.schema_id for channel in index.channels.values()} - {0}
+    return spoken_of <= index.channels.keys() and schema_ids <= index.schemas.keys()
+
+
+def _reaches_all(index: McapIndex) -> bool:
+    """Whether the summary's chunks and metadata are no fewer than its statistics count."""
+    statistics = index.statistics
+    if statistics is None:
+        return bool(index.chunks) and all(chunk.message_index_offsets for chunk in index.chunks)
+    chunks = not statistics.message_count or (bool(index.chunks) and statistics.chunk_count == len(index.chunks))
+    metadata = statistics.metadata_count <= len(index.metadata)
+    return (
+        chunks and metadata and statistics.channel_count <= len(index.channels)
+    )  # libmcap leaves unused ones uncounted
+
+
+def _gaps_are_read(index: McapIndex, reader: RecordReader, data_end: int) -> bool:
+    """Find the messages that lie between the indexed chunks; False where a chunk lies there that the summary does not list."""
+    position = len(MAGIC)
+    ends = [
+        (c.chunk_start_offset, c.chunk_start_offset + c.chunk_length + c.message_index_length) for c in index.chunks
+    ]
+    for gap_end, after in [*sorted(ends), (data_end, data_end)]:
+        while position < gap_end:
+            opcode, length = RECORD_HEAD.unpack(reader.bytes_at(position, RECORD_HEAD.size, f"byte {position}"))
+            if opcode == Opcode.CHUNK:
+                return False
+            if opcode == Opcode.MESSAGE:
+                head = reader.bytes_at(position, RECORD_HEAD.size + MESSAGE_HEAD.size, f"byte {position}")
+                _note_loose(index, position, length, head)
+            position += RECORD_HEAD.size + length
+        if position != gap_end:
+            raise reader.damaged(f"byte {position}", f"a record that runs into what begins at byte {gap_end}")
+        position = after
+    index.loose.sort(key=lambda message: message.log_time_ns)
+    return True
+
+
+def _note_loose(index: McapIndex, position: int, length: int, record: bytes) -> None:
+    channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(record, RECORD_HEAD.size)
+    index.loose.append(LooseMessage(log_time, channel_id, position + RECORD_HEAD.size, length))
+
+
+def _counts_by_message_index(index: McapIndex, reader: RecordReader) -> Counter[int]:
+    counts: Counter[int] = Counter()
+    for chunk in index.chunks:
+        for channel_id, offset in chunk.message_index_offsets.items():
+            head = reader.bytes_at(offset, RECORD_HEAD.size, "a message index")
+            counts[channel_id] += (RECORD_HEAD.unpack(head)[1] - 6) // 16
+    return counts
+
+
+def _add(index: McapIndex, reader: RecordReader, opcode: int, content: bytes, where: str) -> None:
+    if opcode == Opcode.SCHEMA:
+        schema = reader.parse(Schema.read, content, where)
+        index.schemas[schema.id] = schema
+    elif opcode == Opcode.CHANNEL:
+        channel = reader.parse(Channel.read, content, where)
+        index.channels[channel.id] = channel
+    elif opcode == Opcode.CHUNK_INDEX:
+        index.chunks.append(reader.parse(ChunkIndex.read, content, where))
+    elif opcode == Opcode.METADATA_INDEX:
+        index.metadata.append(reader.parse(MetadataIndex.read, content, where))
+    elif opcode == Opcode.STATISTICS:
+        index.statistics = reader.parse(Statistics.read, content, where)
+
+
+# --- from the whole file --------------------------------------------------------------------------------------------
+
+
+def _from_scan(reader: RecordReader) -> McapIndex:
+    """Index a file by reading all of it, its data CRC checked on the way."""
+    index = McapIndex(counts=Counter())
+    crc, position = zlib.crc32(MAGIC), len(MAGIC)
+    while True:
+        head = reader.bytes_at(position, RECORD_HEAD.size, f"the record at byte {position}")
+        opcode, length = RECORD_HEAD.unpack(head)
+        if opcode == Opcode.FOOTER:
+            break
+        record = head + reader.bytes_at(position + RECORD_HEAD.size, length, f"the record at byte {position}")
+        if opcode == Opcode.DATA_END:
+            expected = struct.unpack_from("<I", record, RECORD_HEAD.size)[0] if length >= 4 else 0
+            if expected and expected != crc:
+                raise reader.damaged("the data section", f"CRC {crc:08x} where {expected:08x} was written")
+            break
+        crc = zlib.crc32(record, crc)
+        _scan_record(index, reader, opcode, position, record)
+        position += len(record)
+    _check_described(index, reader)
+    index.loose.sort(key=lambda message: message.log_time_ns)
+    return index
+
+
+def _scan_record(index: McapIndex, reader: RecordReader, opcode: int, position: int, record: bytes) -> None:
+    where = f"byte {position}"
+    if opcode == Opcode.CHUNK:
+        _scan_chunk(index, reader, position, record)
+    elif opcode == Opcode.MESSAGE:
+        if len(record) < RECORD_HEAD.size + MESSAGE_HEAD.size:
+            raise reader.damaged(where, "a message record shorter than its own header")
+        _note_loose(index, position, len(record) - RECORD_HEAD.size, record)
+        index.count(index.loose[-1].channel_id, index.loose[-1].log_time_ns)
+    elif opcode == Opcode.METADATA:
+        index.metadata.append(MetadataIndex(offset=position, length=len(record), name=""))
+    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        _add(index, reader, opcode, record[RECORD_HEAD.size :], where)
+
+
+def _scan_chunk(index: McapIndex, reader: RecordReader, position: int, record: bytes) -> None:
+    where = f"the chunk at byte {position}"
+    chunk = reader.chunk_index_of(record, position)
+    data = reader.chunk_data(chunk)
+    times: list[int] = []
+    for opcode, begin, end in reader.records(data, where):
+        if opcode == Opcode.MESSAGE and end - begin >= MESSAGE_HEAD.size:
+            channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, begin)
+            times.append(log_time)
+            index.count(channel_id, log_time)
+        else:
+            _add(index, reader, opcode, data[begin:end], where)
+    if times and (min(times), max(times)) != (chunk.message_start_time, chunk.message_end_time):
+        raise reader.damaged(where, "its messages do not lie in the time range that its header gives")
+    index.chunks.append(chunk)
+
+
+def _check_described(index: McapIndex, reader: RecordReader) -> None:
+    for channel_id in index.counts or ():
+        if channel_id not in index.channels:
+            raise reader.damaged("its channels", f"messages of channel {channel_id}, which the file does not describe")
+    for channel in index.channels.values():
+        if channel.schema_id and channel.schema_id not in index.schemas:
+            raise reader.damaged(f"topic {channel.topic}", f"its schema {channel.schema_id} is not in the file")
+
+
+def _cut_off(reader: RecordReader) -> LogError:
+    """The error for a file without an end, saying how much of it is intact."""
+    position, chunks, first_ns, last_ns = len(MAGIC), 0, 1 << 64, 0
+    while position + RECORD_HEAD.size <= reader.size:
+        opcode, length = RECORD_HEAD.unpack(reader.bytes_at(position, RECORD_HEAD.size, "a record"))
+        if position + RECORD_HEAD.size + length > reader.size:
+            break
+        if opcode == Opcode.CHUNK and length >= CHUNK_HEAD.size:
+            start, end = struct.unpack("<QQ", reader.bytes_at(position + RECORD_HEAD.size, 16, "a chunk"))
+            chunks, first_ns, last_ns = chunks + 1, min(first_ns, start), max(last_ns, end)
+        position += RECORD_HEAD.size + length
+    intact = f"the first {min(position, reader.size):,} of {reader.size:,} bytes are whole"
+    held = f"{chunks} chunks, {(last_ns - first_ns) / 1e9:.1f} s of messages" if chunks else "no chunk among them"
+    return LogError(
+        "the log is cut off: the recorder was stopped, or a copy did not finish",
+        where=reader.path,
+        found=f"no end mark; {intact} ({held})",
+        remedy=RECOVER,
+    )

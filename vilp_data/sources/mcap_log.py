@@ -1,0 +1,133 @@
+"""MCAP logs: ROS 2 CDR, Foxglove protobuf and JSON messages. One file is one episode."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterator
+from itertools import islice
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from vilp_data.errors import LogError, nearest
+from vilp_data.sources.mcap_file import McapFile, RawMessage
+from vilp_data.sources.message_decoders import MALFORMED, Decoder, decoder_for
+from vilp_data.types import I64, LogEpisode, Message, TopicInfo
+
+END_OF_TIME_NS = 1 << 64  # past every MCAP time stamp
+EPISODE_RECORD = "episode"  # the metadata record whose entries become an episode's tags
+INDEXED_CHUNKS = 5000  # message indexes read by message_times: about 0.3 s
+
+
+WHOLE_FILE = "whole"  # the one demonstration's name: a renamed log must still be known as the same
+
+
+class McapLog:
+    """A `LogReader` over one MCAP file. Opening reads the index only; LogError where the file is cut off or its index damaged."""
+
+    format = "mcap"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = McapFile(path)
+        self._decoders: dict[int, Decoder] = {}
+
+    def sha256(self) -> str:
+        digest = hashlib.sha256()
+        self._file.pass_bytes_to(digest.update)
+        return digest.hexdigest()
+
+    def topics(self) -> list[TopicInfo]:
+        by_topic: dict[str, TopicInfo] = {}
+        index = self._file.index
+        for channel_id, channel in index.channels.items():
+            schema = index.schemas.get(channel.schema_id)
+            count = None if index.counts is None else index.counts[channel_id]
+            if (known := by_topic.get(channel.topic)) is not None and count is not None:
+                count += known.message_count or 0
+            by_topic[channel.topic] = TopicInfo(
+                channel.topic, schema.name if schema else "", channel.message_encoding, count
+            )
+        return sorted(by_topic.values(), key=lambda topic: topic.name)
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        return self._file.metadata()
+
+    def episodes(self) -> list[LogEpisode]:
+        """The whole file as one; none where it holds no message. Tags are its `episode` metadata record."""
+        index = self._file.index
+        if index.first_ns is None or index.last_ns is None:
+            return []
+        return [LogEpisode(WHOLE_FILE, index.first_ns, index.last_ns + 1, self.metadata().get(EPISODE_RECORD, {}))]
+
+    def messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        channel_ids = self._channels_of(topics)
+        start = 0 if start_ns is None else start_ns
+        end = END_OF_TIME_NS if end_ns is None else end_ns
+        for channel_id in channel_ids:
+            self._decoder(channel_id)  # an unreadable topic is refused before the first message of any
+        return (self._decoded(raw) for raw in self._file.messages(channel_ids, start, end))
+
+    def message_times(self) -> tuple[dict[str, I64], bool]:
+        """Topic -> log times [n] in file order, from the message indexes; and whether they are all (else the first part)."""
+        by_channel = self._file.message_times(INDEXED_CHUNKS)
+        channels = self._file.index.channels
+        times = {
+            channels[channel_id].topic: values for channel_id, values in by_channel.items() if channel_id in channels
+        }
+        return times, len(self._file.index.chunks) <= INDEXED_CHUNKS
+
+    def first_messages(self, topic: str, limit: int) -> list[Message]:
+        """Up to `limit` messages from the first chunk that holds the topic: a glance that opens one chunk."""
+        channel_ids = self._channels_of([topic])
+        for chunk in self._file.index.chunks:
+            if chunk.message_index_offsets and channel_ids.isdisjoint(chunk.message_index_offsets):
+                continue
+            found = self._file.chunk_messages(chunk, channel_ids, 0, END_OF_TIME_NS)
+            if found:
+                return [self._decoded(raw) for raw in found[:limit]]
+        loose = self._file.messages(channel_ids, 0, END_OF_TIME_NS) if self._file.index.loose else iter(())
+        return [self._decoded(raw) for raw in islice(loose, limit)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def _channels_of(self, topics: Collection[str]) -> set[int]:
+        channels = self._file.index.channels
+        known = {channel.topic for channel in channels.values()}
+        for topic in topics:
+            if topic not in known:
+                raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, known))
+        return {channel_id for channel_id, channel in channels.items() if channel.topic in topics}
+
+    def _decoder(self, channel_id: int) -> Decoder:
+        if channel_id not in self._decoders:
+            index = self._file.index
+            channel = index.channels[channel_id]
+            schema = index.schemas.get(channel.schema_id)
+            self._decoders[channel_id] = decoder_for(
+                channel.message_encoding, schema, where=f"{self.path}, topic {channel.topic}"
+            )
+        return self._decoders[channel_id]
+
+    def _decoded(self, raw: RawMessage) -> Message:
+        index = self._file.index
+        channel = index.channels[raw.channel_id]
+        schema = index.schemas.get(channel.schema_id)
+        try:
+            body = self._decoder(raw.channel_id)(raw.data)
+        except MALFORMED as error:
+            raise LogError(
+                f"a message of {channel.topic} at {raw.log_time_ns} ns does not fit its schema",
+                where=self.path,
+                found=f"{channel.message_encoding} {schema.name if schema else '(no schema)'}, {len(raw.data)} bytes: {error}",
+                remedy="leave the topic out of the task, or record it with a matching schema",
+            ) from error
+        return Message(channel.topic, schema.name if schema else "", raw.log_time_ns, raw.publish_time_ns, body)

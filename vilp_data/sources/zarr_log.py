@@ -1,0 +1,180 @@
+"""Demonstrations in the diffusion-policy zarr layout: arrays under data/, one row a step, and meta/episode_ends.
+
+Rows carry no time, so row i of the whole store is given log time round(i * 1e9 / array_rate_hz). Zarr chunks have no checksum:
+a missing chunk is refused (zarr would hand out its fill value), a damaged one only where its codec notices.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+import zarr
+from zarr.errors import BaseZarrError
+
+from vilp_data.errors import LogError, UsageError, nearest
+from vilp_data.types import I64, LogEpisode, Message, TopicInfo
+
+RECOPY = "copy the folder again from its source"
+LAYOUT = "expected the diffusion-policy layout: arrays under data/ and row counts in meta/episode_ends"
+
+# What zarr and its codecs raise for damaged metadata or chunks.
+BROKEN = (BaseZarrError, KeyError, ValueError, RuntimeError, TypeError, OSError)
+
+
+class ZarrLog:
+    """A `LogReader` over one zarr store. `array_rate_hz` is the rate its rows were recorded at."""
+
+    format = "zarr"
+
+    def __init__(self, path: Path, *, array_rate_hz: float) -> None:
+        if not array_rate_hz > 0:
+            raise UsageError(f"array_rate_hz must be positive, not {array_rate_hz}", where=path)
+        self.path = path
+        self._rate_hz = array_rate_hz
+        self._arrays, self._ends = _open_store(path)
+        self._cached: dict[str, tuple[int, npt.NDArray[Any]]] = {}  # topic -> (chunk number, its rows)
+
+    def sha256(self) -> str:
+        digest = hashlib.sha256()
+        for file in sorted(self.path.rglob("*"), key=lambda file: file.relative_to(self.path).as_posix()):
+            if file.is_file():
+                digest.update(
+                    file.relative_to(self.path).as_posix().encode() + b"\0" + file.stat().st_size.to_bytes(8, "little")
+                )
+                with file.open("rb") as stream:
+                    while block := stream.read(1 << 20):
+                        digest.update(block)
+        return digest.hexdigest()
+
+    def topics(self) -> list[TopicInfo]:
+        return [TopicInfo(name, "array", "array", self.n_rows) for name in sorted(self._arrays)]
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        return {}
+
+    @property
+    def n_rows(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def episodes(self) -> list[LogEpisode]:
+        digits = max(3, len(str(len(self._ends) - 1)))
+        starts = [0, *self._ends[:-1].tolist()]
+        return [
+            LogEpisode(f"episode_{number:0{digits}d}", self._time_ns(start), self._time_ns(end))
+            for number, (start, end) in enumerate(zip(starts, self._ends.tolist(), strict=True))
+        ]
+
+    def messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        for topic in topics:
+            if topic not in self._arrays:
+                raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, self._arrays))
+        first = 0 if start_ns is None else self._first_row_at(start_ns)
+        stop = self.n_rows if end_ns is None else self._first_row_at(end_ns)
+        return self._rows(sorted(set(topics)), first, stop)
+
+    def message_times(self) -> tuple[dict[str, I64], bool]:
+        """Topic -> log times [n]; and True, for they are all."""
+        times = np.array([self._time_ns(row) for row in range(self.n_rows)], np.int64)
+        return dict.fromkeys(self._arrays, times), True
+
+    def first_messages(self, topic: str, limit: int) -> list[Message]:
+        """The first `limit` rows of one array."""
+        return list(self._rows([topic], 0, min(limit, self.n_rows)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._cached.clear()
+
+    def _rows(self, topics: list[str], first: int, stop: int) -> Iterator[Message]:
+        for row in range(first, stop):
+            time_ns = self._time_ns(row)
+            for topic in topics:
+                number, offset = divmod(row, self._arrays[topic].chunks[0])
+                yield Message(topic, "array", time_ns, time_ns, self._chunk(topic, number)[offset])
+
+    def _chunk(self, topic: str, number: int) -> npt.NDArray[Any]:
+        """All rows of one chunk (of the leading axis), read-only. The latest is kept: neighbouring episodes often share it."""
+        cached = self._cached.get(topic)
+        if cached is not None and cached[0] == number:
+            return cached[1]
+        array = self._arrays[topic]
+        self._refuse_missing(topic, number)
+        try:
+            rows = np.asarray(array[number * array.chunks[0] : (number + 1) * array.chunks[0]])
+        except BROKEN as error:
+            where = f"chunk {number} of data/{topic}"
+            raise LogError(
+                f"{where} cannot be read", where=self.path, found=str(error) or repr(error), remedy=RECOPY
+            ) from error
+        rows.flags.writeable = False
+        self._cached[topic] = number, rows
+        return rows
+
+    def _refuse_missing(self, topic: str, number: int) -> None:
+        metadata = self._arrays[topic].metadata
+        counts = [
+            -(-size // chunk) for size, chunk in zip(self._arrays[topic].shape, self._arrays[topic].chunks, strict=True)
+        ]
+        for rest in np.ndindex(*counts[1:]):
+            key = metadata.encode_chunk_key((number, *rest))
+            if not (self.path / "data" / topic / key).is_file():
+                raise LogError(
+                    f"data/{topic} lacks its chunk {key}",
+                    where=self.path,
+                    found="no such file; zarr would read it as its fill value",
+                    remedy=f"{RECOPY}; if those rows really are empty, write the store with write_empty_chunks=True",
+                )
+
+    def _time_ns(self, row: int) -> int:
+        return round(row * 1e9 / self._rate_hz)
+
+    def _first_row_at(self, time_ns: int) -> int:
+        """The first row at or after a time, at most n_rows."""
+        row = min(max(int(time_ns * self._rate_hz / 1e9) - 1, 0), self.n_rows)
+        while row < self.n_rows and self._time_ns(row) < time_ns:
+            row += 1
+        return row
+
+
+def _open_store(path: Path) -> tuple[dict[str, Any], I64]:
+    try:
+        root = zarr.open_group(path, mode="r")
+        arrays = dict(root["data"].arrays()) if "data" in root else {}
+        ends = np.asarray(root["meta/episode_ends"][:]) if "meta/episode_ends" in root else None
+    except BROKEN as error:
+        raise LogError(
+            "the zarr store cannot be opened", where=path, found=str(error) or repr(error), remedy=RECOPY
+        ) from error
+    if not arrays or ends is None:
+        missing = "data/ holds no array" if not arrays else "there is no meta/episode_ends"
+        raise LogError("not a zarr store of demonstrations", where=path, found=missing, remedy=LAYOUT)
+    _check_rows(path, arrays, ends)
+    return arrays, ends.astype(np.int64)
+
+
+def _check_rows(path: Path, arrays: dict[str, Any], ends: npt.NDArray[Any]) -> None:
+    if (
+        ends.ndim != 1
+        or ends.dtype.kind not in "iu"
+        or not len(ends)
+        or int(ends[0]) <= 0
+        or (np.diff(ends.astype(np.int64)) <= 0).any()
+    ):
+        found = f"shape {ends.shape}, {ends.dtype}, {ends.ravel()[:5].tolist()} …"
+        raise LogError("meta/episode_ends must rise, one row count an episode", where=path, found=found, remedy=LAYOUT)
+    for name, array in arrays.items():
+        if array.ndim == 0 or array.shape[0] < int(ends[-1]):
+            found = f"shape {array.shape}, while meta/episode_ends counts {int(ends[-1])} rows"
+            raise LogError(f"data/{name} is shorter than its episodes", where=path, found=found, remedy=RECOPY)

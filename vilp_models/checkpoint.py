@@ -1,0 +1,135 @@
+"""Checkpoints: one safetensors file a run, replaced whole: all that resuming needs, and nothing that runs code.
+
+A run's folder is `<run_dir>/<views joined by +>/`, since views may share one network:
+    checkpoint.safetensors   model/… and trainer/… (optimiser, discriminator, counters); its header: recipe and state
+    recipe.json              the resolved recipe again, for people
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vilp_data.errors import StoreError, UsageError, nearest
+from vilp_data.shards import read_header, read_shard, write_atomic, write_shard
+
+FORMAT = "vilp-checkpoint-1"
+FILE = "checkpoint.safetensors"
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class RunState:
+    """Where a run is and what it learns from.
+
+    step            optimiser steps done
+    steps           steps in all; the run is finished when they are equal
+    views           views whose frames it sees
+    split_hash      hash of the split that chose the episodes
+    train_episodes  episode id -> episode key, of every training episode
+    """
+
+    step: int
+    steps: int
+    views: tuple[str, ...]
+    split_hash: str
+    train_episodes: Mapping[str, str]
+
+    @property
+    def finished(self) -> bool:
+        return self.step >= self.steps
+
+    @property
+    def training_set(self) -> str:
+        """SHA-256 over views and training episodes: equal for runs that learn from the same frames."""
+        return hashlib.sha256(json.dumps([self.views, sorted(self.train_episodes.items())]).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A run at one moment: `model` is what others load, `trainer` what resuming needs besides."""
+
+    model: Arrays
+    trainer: Arrays
+    recipe: Mapping[str, Any]
+    state: RunState
+
+
+def run_folder(run_dir: Path, views: Sequence[str]) -> Path:
+    """Folder of the run that these views share. View names hold no "+"."""
+    return run_dir / "+".join(sorted(views))
+
+
+def run_for_view(run_dir: Path, view: str) -> Path:
+    """Folder of the run trained on `view`. Raises UsageError naming the views there are."""
+    runs = [path.parent for path in sorted(run_dir.glob(f"*/{FILE}"))]
+    for run in runs:
+        if view in run.name.split("+"):
+            return run
+    known = [name for run in runs for name in run.name.split("+")]
+    remedy = nearest(view, known) if known else "train one with `vilp-models train vqgan`"
+    raise UsageError(f"no trained network for view {view!r}", where=run_dir, remedy=remedy)
+
+
+def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
+    """Replace the run's checkpoint. A crash leaves the one before. Raises StoreError (full disk, no permission)."""
+    recipe = json.dumps(checkpoint.recipe, indent=2, sort_keys=True)
+    write_atomic(run / "recipe.json", (recipe + "\n").encode())
+    tensors = {f"model/{name}": array for name, array in checkpoint.model.items()}
+    tensors |= {f"trainer/{name}": array for name, array in checkpoint.trainer.items()}
+    header = {"format": FORMAT, "recipe": recipe, "state": json.dumps(asdict(checkpoint.state), sort_keys=True)}
+    write_shard(run / FILE, tensors, header)
+
+
+def load_checkpoint(run: Path) -> Checkpoint:
+    """The run's checkpoint, checksum verified. Raises StoreError where it is missing, damaged or of another format."""
+    header = _header(run)
+    arrays = read_shard(run / FILE).arrays
+    return Checkpoint(
+        _under("model/", arrays), _under("trainer/", arrays), json.loads(header["recipe"]), _state(header)
+    )
+
+
+def model_tensors(run: Path) -> Arrays:
+    """The network's tensors alone, writable, checksum verified."""
+    return load_checkpoint(run).model
+
+
+def read_recipe(run: Path) -> dict[str, Any]:
+    """The resolved recipe that the run was trained with, from its checkpoint."""
+    recipe: dict[str, Any] = json.loads(_header(run)["recipe"])
+    return recipe
+
+
+def read_state(run: Path) -> RunState | None:
+    """Where the run is, without reading its tensors; None where it has not begun."""
+    return _state(_header(run)) if (run / FILE).is_file() else None
+
+
+def _header(run: Path) -> dict[str, str]:
+    metadata = read_header(run / FILE).metadata
+    found = metadata.get("format", "no format")
+    if found != FORMAT:
+        raise StoreError(
+            f"not a checkpoint of format {FORMAT}",
+            where=run / FILE,
+            found=found,
+            remedy="train again into another folder",
+        )
+    return metadata
+
+
+def _state(header: Mapping[str, str]) -> RunState:
+    table = json.loads(header["state"])
+    return RunState(**{**table, "views": tuple(table["views"])})
+
+
+def _under(prefix: str, arrays: Arrays) -> Arrays:
+    return {name.removeprefix(prefix): np.array(array) for name, array in arrays.items() if name.startswith(prefix)}

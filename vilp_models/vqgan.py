@@ -1,0 +1,174 @@
+"""The VQGAN: frames to latents and back (Esser et al. 2021; the paper's section on the video planner, first stage).
+
+The network is diffusers' `VQModel`. Shape suffixes: B batch, C channels, H height, W width; latents are [B,c,h,w] with
+h = H / f and w = W / f, taken after `quant_conv` and before quantisation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+from diffusers import VQModel
+from torch import Tensor
+
+from vilp_data.errors import UsageError
+from vilp_data.keys import digest
+from vilp_data.types import F16, F32, I64, U8
+from vilp_models.checkpoint import model_tensors, read_recipe, read_state, run_for_view
+from vilp_models.recipe import Precision, VqganRecipe
+
+LATENT_SCALING = 1.0
+"""Latents are stored as the encoder gives them; whoever trains on them standardises with their statistics."""
+
+
+def build_vqgan(recipe: VqganRecipe) -> VQModel:
+    """An untrained VQGAN. Input and output are [B,3,H,W] in [-1, 1]; H and W are multiples of `recipe.downsampling`."""
+    levels = len(recipe.channels)
+    model = VQModel(
+        down_block_types=("DownEncoderBlock2D",) * levels,
+        up_block_types=("UpDecoderBlock2D",) * levels,
+        block_out_channels=recipe.channels,
+        layers_per_block=recipe.blocks,
+        latent_channels=recipe.latent_channels,
+        num_vq_embeddings=recipe.codes,
+        norm_num_groups=recipe.groups,
+        scaling_factor=LATENT_SCALING,
+    )
+    # diffusers hard-wires the swapped weights of the first VQGAN release: commitment belongs on the encoder's term.
+    model.quantize.legacy = False
+    model.quantize.beta = recipe.commitment
+    return model
+
+
+def check_divisible(height: int, width: int, downsampling: int) -> None:
+    """Raise UsageError where the network cannot halve such images as often as it must."""
+    if height % downsampling or width % downsampling:
+        raise UsageError(
+            f"a VQGAN that downsamples by {downsampling} needs image sides that are multiples of it",
+            found=f"{height}x{width}",
+            remedy="change the view's height and width, or give models.vqgan.multipliers fewer levels",
+        )
+
+
+def to_signed(frames_BHWC: Tensor) -> Tensor:
+    """uint8 [B,H,W,3] to float32 [B,3,H,W] in [-1, 1]."""
+    return frames_BHWC.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+
+
+def to_frames(images_BCHW: Tensor) -> Tensor:
+    """[-1, 1] back to uint8 [B,H,W,3], rounded and clipped; the inverse of `to_signed`."""
+    return ((images_BCHW.float() + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+
+
+def nearest_codes(z_BCHW: Tensor, codebook_KC: Tensor) -> Tensor:
+    """Index of the nearest code of every latent pixel: int64 [B,h,w]."""
+    z = z_BCHW.permute(0, 2, 3, 1)
+    return torch.cdist(z.flatten(0, 2).float(), codebook_KC.float()).argmin(dim=1).view(z.shape[:3])
+
+
+class VqganEncoder:
+    """A trained VQGAN behind vilp_data's `FrameEncoder` protocol. Frames are RGB, top row first.
+
+    On a CPU the bytes of latents depend on the batch size and on torch's thread count, which the caller keeps fixed.
+    """
+
+    def __init__(
+        self,
+        model: VQModel,
+        *,
+        precision: Precision = "f32",
+        trained_on: Iterable[str] = (),
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.device = torch.device(device)
+        self.precision: Precision = precision
+        self.trained_on = frozenset(trained_on)
+        self.model = model.eval().requires_grad_(False).to(self.device, memory_format=torch.channels_last)
+        self.downsampling = 2 ** (len(model.config.block_out_channels) - 1)
+
+    @property
+    def codes(self) -> int:
+        """Size of the codebook."""
+        return int(self.model.quantize.n_e)
+
+    @property
+    def key(self) -> str:
+        """16 hex digits: the digest of `key_fields`."""
+        return digest(self.key_fields)[:16]
+
+    @property
+    def key_fields(self) -> dict[str, str]:
+        """All that decides the bytes of stored latents, and nothing else: decoder and codebook have no part in it."""
+        weights = encoder_digest(self.model)
+        return {"weights": weights, "scaling": str(LATENT_SCALING), "compute": self.precision, "storage": "f16"}
+
+    def latent_shape(self, height: int, width: int) -> tuple[int, int, int]:
+        """(c, h, w) for frames of this size. Raises UsageError where the size does not divide."""
+        check_divisible(height, width, self.downsampling)
+        return self.model.config.latent_channels, height // self.downsampling, width // self.downsampling
+
+    def encode(self, frames: U8) -> F16:
+        """uint8 [B,H,W,3] to float16 [B,c,h,w], before quantisation."""
+        return self.encode_f32(frames, precision=self.precision).astype(np.float16)
+
+    @torch.inference_mode()
+    def encode_f32(self, frames: U8, *, precision: Precision = "f32") -> F32:
+        """As `encode`, before rounding to float16; computed in float32 unless told otherwise."""
+        self.latent_shape(*frames.shape[1:3])
+        x = to_signed(torch.tensor(frames, device=self.device)).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=precision == "bf16"):
+            z = self.model.encode(x).latents
+        latents: F32 = z.float().contiguous().cpu().numpy()
+        return latents
+
+    @torch.inference_mode()
+    def codes_of(self, latents: F16 | F32) -> I64:
+        """[B,c,h,w] to the indices of the nearest codes, int64 [B,h,w]."""
+        z = torch.tensor(latents, device=self.device).float()
+        return nearest_codes(z, self.model.quantize.embedding.weight).cpu().numpy()
+
+    @torch.inference_mode()
+    def decode(self, latents: F16 | F32) -> U8:
+        """[B,c,h,w] before quantisation to uint8 [B,H,W,3]: quantised, then decoded."""
+        z = torch.tensor(latents, device=self.device).float()
+        return to_frames(self.model.decode(z).sample).cpu().numpy()
+
+
+def encoder_digest(model: VQModel) -> str:
+    """SHA-256 over the tensors of the encoder and of quant_conv, by sorted name."""
+    sha = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        if name.startswith(("encoder.", "quant_conv.")):
+            array = tensor.detach().cpu().contiguous().numpy()
+            sha.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+            sha.update(array.tobytes())
+    return sha.hexdigest()
+
+
+def load_vqgan(run: Path) -> tuple[VQModel, VqganRecipe]:
+    """The trained network in one run's folder, and its recipe. Raises StoreError where it is missing or damaged."""
+    recipe = VqganRecipe.model_validate(read_recipe(run))
+    model = build_vqgan(recipe)
+    model.load_state_dict({name: torch.from_numpy(array) for name, array in model_tensors(run).items()})
+    return model, recipe
+
+
+def load_frame_encoder(run_dir: Path, view: str) -> VqganEncoder:
+    """The frame encoder of one view: what the entry-point group `vilp.frame_encoders` names.
+
+    `run_dir` is what `train_vqgan` wrote. Raises UsageError where no VQGAN there was trained on this view, StoreError
+    where the checkpoint is damaged.
+    """
+    run = run_for_view(run_dir, view)
+    model, recipe = load_vqgan(run)
+    state = read_state(run)
+    return VqganEncoder(
+        model,
+        precision=recipe.encode_precision,
+        trained_on=state.train_episodes.values() if state is not None else (),
+        device="cuda" if torch.cuda.is_available() else "cpu",
+    )
