@@ -202,6 +202,15 @@ def test_a_torch_data_loader_takes_whole_batches(root: Path) -> None:
         assert_equal(batch, dataset.read(range(start, min(start + 4, len(dataset)))))
 
 
+@pytest.mark.gpu
+def test_pinned_batches_hold_the_same_in_page_locked_memory(root: Path) -> None:
+    dataset = opened(root)
+    pinned = dataset.read([0, 7], pin_memory=True)
+    assert pinned.frames["front"].is_pinned()
+    assert pinned.low_dim.is_pinned()
+    assert_equal(pinned.to("cuda").to("cpu"), dataset.read([0, 7]))
+
+
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts descriptors in /proc")
 def test_open_episodes_hold_no_file_descriptors(root: Path) -> None:
     dataset = opened(root)

@@ -23,13 +23,14 @@ class Numbers:
     """A dataset whose batches are the sample numbers themselves; it can break at one of its reads."""
 
     def __init__(self, n: int, *, breaks_at: int | None = None) -> None:
-        self.n, self.breaks_at, self.reads = n, breaks_at, 0
+        self.n, self.breaks_at, self.reads, self.pinned = n, breaks_at, 0, False
 
     def __len__(self) -> int:
         return self.n
 
     def read(self, numbers: np.ndarray, *, pin_memory: bool = False) -> list[int]:
         self.reads += 1
+        self.pinned = pin_memory
         if self.reads == self.breaks_at:
             raise StoreError("damaged", where="shard")
         return numbers.tolist()
@@ -175,6 +176,13 @@ def test_the_last_batch_of_an_epoch_leads_to_the_next_one() -> None:
     for _ in loader:
         state = loader.state_dict()
     assert state == {"seed": 9, "epoch": 1, "step": 0}
+
+
+@pytest.mark.parametrize("pin_memory", [False, True])
+def test_pinning_is_asked_of_the_dataset(pin_memory: bool) -> None:
+    dataset = Numbers(64)
+    list(Loader(dataset, batch_size=8, pin_memory=pin_memory))
+    assert dataset.pinned is pin_memory
 
 
 def test_several_ranks_read_what_one_would() -> None:

@@ -73,10 +73,8 @@ def test_every_human_frame_is_drawn_as_stored():
     reports = [render_match(human_episode(number), env) for number in range(N_EPISODES)]
     scores = np.concatenate([report.psnr_db["top"] for report in reports])
     off = np.concatenate([report.next_step_db["top"] for report in reports])
+    print(f"{len(scores)} frames: worst {scores.min():.1f} dB, equal {np.mean(scores == 100):.1%}")
     print(
-        f"{len(scores)} frames: worst {scores.min():.1f} dB, median {np.median(scores):.1f} dB, equal {np.mean(scores == 100):.1%}"
-    )
-    print(
-        f"one step off: worst {off.min():.1f} dB, median {np.median(off):.1f} dB, below {RENDER_MIN_DB:g} dB {np.mean(off < RENDER_MIN_DB):.1%}"
+        f"one step off: median {np.median(off):.1f} dB, {np.mean(off < RENDER_MIN_DB):.1%} below {RENDER_MIN_DB:g} dB"
     )
     assert all(report.proves() for report in reports)

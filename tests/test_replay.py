@@ -26,7 +26,7 @@ class Integrator:
         return {}, {"state": self.state}
 
     def step(self, action):
-        self.state = self.state + (action[0], action[0], 0)
+        self.state = self.state + np.array([action[0], action[0], 0])
         return {}, 0.0, True, False, {"state": self.state}
 
 

@@ -250,7 +250,8 @@ def _findings(valid: Mapping[str, Bool], images: Mapping[str, tuple[U8, I32]]) -
     """Plain sentences about what was masked or repeated, with counts."""
     for name, usable in valid.items():
         if masked := int(np.count_nonzero(~usable)):
-            yield f"{name}: missing, stale or not finite at {masked} of {len(usable)} steps, first at step {int(np.argmin(usable))}; those steps are masked"
+            where = f"{masked} of {len(usable)} steps, first at step {int(np.argmin(usable))}"
+            yield f"{name}: missing, stale or not finite at {where}; those steps are masked"
     for view, (_, index) in images.items():
         if repeated := int(np.count_nonzero(np.diff(index) == 0)):
             yield f"view {view}: {repeated} of {len(index)} steps see the image of the step before"

@@ -220,16 +220,14 @@ def split(
         print(lock.to_json().decode())
         return
     train, val = lock.ids("train"), lock.ids("val")
-    print(
-        f"{lock_path(root)}: {len(train)} training, {len(val)} validation episodes (ratio {lock.ratio:g} from the {lock.ratio_from}, seed {lock.seed})"
-    )
+    drawn = f"ratio {lock.ratio:g} from the {lock.ratio_from}, seed {lock.seed}"
+    print(f"{lock_path(root)}: {len(train)} training, {len(val)} validation episodes ({drawn})")
     for group in lock.duplicates:
         print(f"  identical, kept on one side: {', '.join(group)}")
     crossing = [pair for pair in lock.near_duplicates if lock.assignment[pair.first] != lock.assignment[pair.second]]
     if crossing:
-        print(
-            f"  {len(crossing)} pairs across the sides look nearly alike, closest: {crossing[0].first} and {crossing[0].second}; see near_duplicates in the lock"
-        )
+        closest = f"{crossing[0].first} and {crossing[0].second}"
+        print(f"  {len(crossing)} pairs across the sides look nearly alike, closest {closest}; see the lock")
 
 
 # --- latents -------------------------------------------------------------------------------------------------------------
@@ -269,13 +267,10 @@ def latents(
             + ("" if done.written[view] else ", all there already")
         )
     if done.frames:
-        print(
-            f"{done.frames} frames encoded at {done.frames_per_s:.0f} frames/s, {done.ratio:.0%} of the bare forward loop ({done.bare_frames_per_s:.0f} frames/s)"
-        )
+        bare = f"{done.ratio:.0%} of the bare forward loop ({done.bare_frames_per_s:.0f} frames/s)"
+        print(f"{done.frames} frames encoded at {done.frames_per_s:.0f} frames/s, {bare}")
     if done.unseen:
-        print(
-            f"  {len(done.unseen)} episodes came after the encoder was trained, which has not seen them: {', '.join(done.unseen[:5])}"
-        )
+        print(f"  {len(done.unseen)} training episodes are new to the encoder: {', '.join(done.unseen[:5])}")
 
 
 @app.command("why-stale")

@@ -6,6 +6,7 @@ are touched, so memory does not grow with the dataset; values are handed out as 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -23,11 +24,14 @@ from vilp_data.errors import SplitError, StoreError, UsageError, nearest
 from vilp_data.latents import latents_path
 from vilp_data.spec import WindowSpec
 from vilp_data.split_lock import SplitLock
-from vilp_data.types import I64, Bool
+from vilp_data.types import I64
 
 # Linux allows a process 65,530 maps (vm.max_map_count); half of them are left to everything else.
 MAX_MAPS = 32_768
 _ENCODE = "run `vilp-data latents`"
+_ALIGNMENT = 64
+
+_Layout = dict[str, tuple[tuple[int, ...], torch.dtype]]
 
 
 @dataclass(frozen=True)
@@ -174,24 +178,35 @@ class WindowDataset(Dataset[WindowTensors]):
         acted, action_mask = windows.action_steps(step, n_steps, n_plan_frames=n_plan_frames, frame_stride=frame_stride)
         action_mask &= self._has_action[episode, None]
 
-        batch = self._empty_batch(episode, step, latent_mask, action_mask, pin_memory)
+        batch = self._empty_batch(len(step), pin_memory=pin_memory)
+        for tensor, values in (
+            (batch.latent_mask, latent_mask),
+            (batch.action_mask, action_mask),
+            (batch.episode, episode),
+            (batch.step, step),
+        ):
+            tensor.numpy()[:] = values
+        self._copy_windows(batch, planned, acted)
+        return batch
+
+    def _copy_windows(self, batch: WindowTensors, planned: I64, acted: I64) -> None:
+        """Fill what comes from files: the batch's episodes and steps say where, `planned` and `acted` which steps."""
         latents = [tensor.numpy() for tensor in batch.latents.values()]
         frames = [tensor.numpy() for tensor in batch.frames.values()]
         low_dim = batch.low_dim.numpy()
         action = None if batch.action is None else batch.action.numpy()
-        for row, (number, first) in enumerate(zip(episode.tolist(), step.tolist(), strict=True)):
+        for row, (number, first) in enumerate(zip(batch.episode.tolist(), batch.step.tolist(), strict=True)):
             arrays = self._open(number)
             low_dim[row] = arrays.low_dim[first]
+            # mode="clip" lets take() write in place; every index was checked when the episode was opened
             if action is not None and arrays.action is not None:
                 arrays.action.take(acted[row], axis=0, out=action[row], mode="clip")
-            # mode="clip" lets take() write in place; every index was checked when the episode was opened
             for place, view in enumerate(arrays.views):
                 view.latents.take(view.source_index[planned[row]], axis=0, out=latents[place][row], mode="clip")
                 if view.frames is not None:
                     frames[place][row] = view.frames[view.source_index[first]]
         if action is not None:
-            action[~action_mask] = 0
-        return batch
+            action[~batch.action_mask.numpy()] = 0
 
     def __getstate__(self) -> dict[str, Any]:
         """Maps stay behind: a worker process opens its own."""
@@ -220,10 +235,8 @@ class WindowDataset(Dataset[WindowTensors]):
         path = latents_path(self._store.root, view, self._latent_keys[view], entry.id)
         shard = shards.open_shard(path)
         source, latents = steps[f"source_index/{view}"], shard.arrays["latents"]
-        if (
-            shard.metadata.get("source_frames_sha256") != entry.frames_sha256[view]
-            or len(latents) != entry.n_frames[view]
-        ):
+        of_today = shard.metadata.get("source_frames_sha256") == entry.frames_sha256[view]
+        if not of_today or len(latents) != entry.n_frames[view]:
             raise StoreError("latents of other frames than the episode has today", where=path, remedy=_ENCODE)
         used = source[steps["valid"]]
         if used.size and (used.min() < 0 or used.max() >= len(latents)):
@@ -233,10 +246,9 @@ class WindowDataset(Dataset[WindowTensors]):
                 found=f"frames {used.min()} to {used.max()} of {len(latents)}",
                 remedy="run `vilp-data ingest` on its log again",
             )
-        frames = (
-            shards.open_shard(self._store.frames_path(view, entry.id)).arrays["frames"] if self._with_frames else None
-        )
-        return _View(source, latents, frames)
+        if not self._with_frames:
+            return _View(source, latents, None)
+        return _View(source, latents, shards.open_shard(self._store.frames_path(view, entry.id)).arrays["frames"])
 
     # --- shapes
 
@@ -274,26 +286,52 @@ class WindowDataset(Dataset[WindowTensors]):
                 remedy="ingest every log with one task file, then run `vilp-data latents`",
             )
 
-    def _empty_batch(self, episode: I64, step: I64, latent_mask: Bool, action_mask: Bool, pin: bool) -> WindowTensors:
-        def empty(shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
-            return torch.empty((len(step), *shape), dtype=dtype, pin_memory=pin)
-
-        def filled(values: npt.NDArray[Any]) -> torch.Tensor:
-            tensor = torch.from_numpy(values)
-            return tensor.pin_memory() if pin else tensor
-
+    def _empty_batch(self, size: int, *, pin_memory: bool) -> WindowTensors:
         n_plan_frames, shapes = self._window.n_plan_frames, self._shapes
-        action_shape = None if shapes.action is None else (action_mask.shape[1], *shapes.action)
+        n_actions = n_plan_frames * self._window.frame_stride
+        layout: _Layout = {
+            "latent_mask": ((size, n_plan_frames), torch.bool),
+            "low_dim": ((size, *shapes.low_dim), torch.float32),
+            "action_mask": ((size, n_actions), torch.bool),
+            "episode": ((size,), torch.int64),
+            "step": ((size,), torch.int64),
+        }
+        if shapes.action is not None:
+            layout["action"] = ((size, n_actions, *shapes.action), torch.float32)
+        layout |= {f"frames/{view}": ((size, *shape), torch.uint8) for view, shape in shapes.frames.items()}
+        latents = {view: ((size, n_plan_frames, *shape), torch.float16) for view, shape in shapes.latents.items()}
+        layout |= {f"latents/{view}": value for view, value in latents.items()}
+        tensors = _allocated(layout, pin_memory=pin_memory)
         return WindowTensors(
-            frames={view: empty(shape, torch.uint8) for view, shape in shapes.frames.items()},
-            latents={view: empty((n_plan_frames, *shape), torch.float16) for view, shape in shapes.latents.items()},
-            latent_mask=filled(latent_mask),
-            low_dim=empty(shapes.low_dim, torch.float32),
-            action=None if action_shape is None else empty(action_shape, torch.float32),
-            action_mask=filled(action_mask),
-            episode=filled(episode),
-            step=filled(step),
+            frames={view: tensors[f"frames/{view}"] for view in shapes.frames},
+            latents={view: tensors[f"latents/{view}"] for view in shapes.latents},
+            latent_mask=tensors["latent_mask"],
+            low_dim=tensors["low_dim"],
+            action=tensors.get("action"),
+            action_mask=tensors["action_mask"],
+            episode=tensors["episode"],
+            step=tensors["step"],
         )
+
+
+def _allocated(layout: _Layout, *, pin_memory: bool) -> dict[str, torch.Tensor]:
+    """Uninitialised tensors that share one block of memory: many blocks of several MB a batch would fragment the heap."""
+    begins, end = [], 0
+    for shape, dtype in layout.values():
+        begins.append(end)
+        end += -(-math.prod(shape) * dtype.itemsize // _ALIGNMENT) * _ALIGNMENT
+    block = _block(end, pin_memory=pin_memory)
+    return {
+        name: block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
+        for begin, (name, (shape, dtype)) in zip(begins, layout.items(), strict=True)
+    }
+
+
+def _block(n_bytes: int, *, pin_memory: bool) -> torch.Tensor:
+    if pin_memory:
+        return torch.empty(n_bytes, dtype=torch.uint8, pin_memory=True)
+    # torch would ask for aligned memory, and glibc's heap grows on that instead of reusing what was freed: 50 MB more
+    return torch.from_numpy(np.empty(n_bytes, np.uint8))
 
 
 def _side(store: EpisodeStore, split: Literal["train", "val", "all"]) -> list[EpisodeEntry]:

@@ -71,6 +71,16 @@ def decode_image(message: Message) -> U8:
     )
 
 
+def encoded_image(message: Message) -> tuple[bytes, str] | None:
+    """A compressed image's bytes as they were recorded, and their media type (`image/jpeg`, `image/png`); None for any other message."""
+    if message.schema not in COMPRESSED_IMAGES:
+        return None
+    data = _payload(message).tobytes()
+    if data.startswith(JPEG_START):
+        return data, "image/jpeg"
+    return (data, "image/png") if data.startswith(PNG_START) else None
+
+
 def image_encoding(message: Message) -> str:
     """How an image message holds its pixels, in its own words: `rgb8`, `jpeg`, `float32`."""
     if message.schema == "array":
@@ -300,12 +310,10 @@ def _follow(message: Message, path: str, steps: tuple[Step, ...]) -> Any:
 
 
 def _item(message: Message, path: str, value: Any, step: int | slice) -> Any:
-    try:
-        length = len(value)
-    except TypeError:
-        raise _cannot(
-            message, f"field {path!r}: only lists and arrays have items", type(value).__name__, "leave the brackets out"
-        ) from None
+    if isinstance(value, dict) or not hasattr(value, "__len__"):
+        found = type(value).__name__
+        raise _cannot(message, f"field {path!r}: only lists and arrays have items", found, "leave the brackets out")
+    length = len(value)
     last = step.stop if isinstance(step, slice) else step + 1
     if last > length or (isinstance(step, slice) and step.start >= step.stop):
         raise _cannot(

@@ -67,7 +67,7 @@ class Loader(Generic[Batch]):
     for batch in loader: …      the rest of the current epoch; the next loop is the next epoch
     loader.state_dict()         three integers: where the batch after the last one handed out lies
 
-    A batch of `batch_size` is shared by `n_ranks`, each reading its part. What reading raises is raised in the loop, and
+    A batch of `batch_size` is shared by `n_ranks`, each reading its part. What reading raises is raised in the loop;
     leaving the loop by any way (break, exception, Ctrl-C) ends the thread.
     """
 

@@ -25,7 +25,7 @@ from vilp_data.types import F32, F64, U8, Episode
 from vilp_models.metrics import psnr
 
 RENDER_MIN_DB = 40.0
-"""What frames drawn from recorded states score at least against the stored ones. A swapped channel gets 29 on Push-T."""
+"""What frames drawn from recorded states score at least against the stored ones; a swapped channel gets 29."""
 
 LISTED_STATES = 8
 """How many dimensions of the state a report prints; Hanoi has dozens."""

@@ -20,7 +20,9 @@ from vilp_models.vqgan import build_vqgan, check_divisible, to_signed
 from vilp_models.vqgan_loss import PatchDiscriminator, adaptive_weight, discriminator_loss, weighted_l1
 
 CODEBOOK_BATCHES = 8
-"""Batches whose latents the first codebook is drawn from."""
+"""Batches whose latents the first codebook is fitted to."""
+
+K_MEANS_ROUNDS = 10
 
 
 class DivergedError(VilpDataError):
@@ -136,7 +138,8 @@ class VqganTraining:
         """Put the codes on the encoder's outputs: diffusers starts them within 1/codes of zero, which collapses."""
         latents = [self.model.encode(self._batch(i)[0]).latents for i in range(CODEBOOK_BATCHES)]
         vectors = torch.cat([z.permute(0, 2, 3, 1).flatten(0, 2) for z in latents])
-        self.model.quantize.embedding.weight.copy_(spread_sample(vectors, self.recipe.codes, self._random(0)))
+        codes = spread_sample(vectors, self.recipe.codes, self._random(0))
+        self.model.quantize.embedding.weight.copy_(k_means(vectors, codes))
 
     @torch.no_grad()
     def _count_codes(self, index: int, codes: Tensor, latents: Tensor) -> None:
@@ -209,6 +212,17 @@ def spread_sample(vectors_NC: Tensor, count: int, random: np.random.Generator) -
     )
     second = random.choice(n, size=count // 2, p=distance / distance.sum())
     return torch.cat([vectors_NC[first], vectors_NC[torch.from_numpy(second).to(vectors_NC.device)]])
+
+
+def k_means(vectors_NC: Tensor, centres_KC: Tensor, *, rounds: int = K_MEANS_ROUNDS) -> Tensor:
+    """Lloyd's iterations from `centres_KC`: the moved centres [K,C]; one that is nearest to no vector stays."""
+    vectors, centres = vectors_NC.float(), centres_KC.float().clone()
+    for _ in range(rounds):
+        nearest = torch.cdist(vectors, centres).argmin(dim=1)
+        count = torch.bincount(nearest, minlength=len(centres))
+        total = torch.zeros_like(centres).index_add_(0, nearest, vectors)
+        centres = torch.where(count[:, None] > 0, total / count[:, None].clamp(min=1), centres)
+    return centres
 
 
 def _check_size(recipe: VqganRecipe, height: int, width: int) -> None:

@@ -116,7 +116,7 @@ def test_another_recipe_or_lost_episodes_are_refused_unless_restarted(
     store: EpisodeStore, spec: TaskSpec, run_dir: Path
 ) -> None:
     _train(store, spec, tiny_recipe(), run_dir)
-    with pytest.raises(UsageError, match="learning_rate = 0.002 there, 0.01 now"):
+    with pytest.raises(UsageError, match=r"learning_rate = 0\.002 there, 0\.01 now"):
         _train(store, spec, tiny_recipe(learning_rate=1e-2), run_dir)
     with pytest.raises(UsageError, match="found: c"):
         _train(store, spec, tiny_recipe(), run_dir, "ab")

@@ -31,9 +31,10 @@ def _bytes(saved: tuple[Arrays, Arrays]) -> dict[str, bytes]:
 
 
 def test_one_batch_can_be_overfitted() -> None:
-    training = VqganTraining(tiny_recipe(steps=60, learning_rate=5e-3), card_frames(1))
+    recipe = tiny_recipe(steps=60, codebook_start=30, learning_rate=5e-3, schedule="cosine")
+    training = VqganTraining(recipe, card_frames(1))
     losses = [training.step(index)["l1"] for index in range(60)]
-    assert losses[-1] < 0.3 * losses[0]
+    assert losses[-1] < 0.25 * losses[0]
 
 
 @pytest.mark.parametrize(
@@ -51,7 +52,7 @@ def test_losses_that_are_not_finite_stop_before_any_weight_changes() -> None:
     with torch.no_grad():
         training.model.decoder.conv_out.bias[0] = float("nan")
     before = _bytes(training.save())
-    with pytest.raises(DivergedError, match="not finite|no longer finite"):
+    with pytest.raises(DivergedError, match="no longer finite"):
         training.step(2)
     assert _bytes(training.save()) == before
 
@@ -70,7 +71,7 @@ def test_the_codebook_starts_on_the_encoders_outputs() -> None:
     frames, _ = card_frames().batch(seed=0, step=0, size=4)
     z = training.model.encode(torch.from_numpy(frames).permute(0, 3, 1, 2) / 127.5 - 1).latents
     vectors = z.permute(0, 2, 3, 1).flatten(0, 2)
-    assert torch.cdist(vectors, training.model.quantize.embedding.weight).amin(1).mean() < 0.2 * vectors.std()
+    assert torch.cdist(vectors, training.model.quantize.embedding.weight).amin(1).mean() < 0.4 * vectors.std()
 
 
 def test_commitment_weighs_the_encoders_term() -> None:

@@ -121,12 +121,12 @@ def test_an_unknown_topic_is_refused_with_the_nearest_one(tmp_path: Path) -> Non
         read(log.path, ["/joint_state"])
 
 
-def test_the_file_is_one_episode_named_after_it_with_its_tags(tmp_path: Path) -> None:
+def test_the_file_is_one_episode_whose_name_survives_renaming_and_whose_tags_are_its_metadata(tmp_path: Path) -> None:
     log = write_mcap(tmp_path / "take_07.mcap", tags={"success": "true", "seed": "7"})
     with open_log(log.path) as reader:
         (episode,) = reader.episodes()
         assert reader.metadata() == {"episode": {"success": "true", "seed": "7"}}
-    assert (episode.name, episode.tags) == ("take_07", {"success": "true", "seed": "7"})
+    assert (episode.name, episode.tags) == ("whole", {"success": "true", "seed": "7"})
     assert episode.start_ns == START_NS + HEADER_LAG_NS
     assert len(read(log.path, start_ns=episode.start_ns, end_ns=episode.end_ns)) == len(read(log.path))
 

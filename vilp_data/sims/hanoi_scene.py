@@ -34,6 +34,7 @@ PEG_RADIUS = 0.006
 DISC_HEIGHT = 0.014
 DISC_RADII = (0.025, 0.031, 0.037)  # the gripper opens to 80 mm
 DISC_HOLE_RADIUS = 0.012
+DISC_SIDES = 8  # boxes a ring is made of; resting contacts, and with them the time of a step, grow with its square
 DISC_COLOURS = ((0.85, 0.12, 0.10, 1.0), (0.10, 0.55, 0.15, 1.0), (0.10, 0.25, 0.80, 1.0))
 PEG_COLOUR = (0.95, 0.75, 0.10, 1.0)
 MAX_POSITION_STEP = 0.05  # what the controller's ±1 means, in metres and in radians
@@ -131,7 +132,7 @@ class HanoiScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no typ
         ]
         self.discs = [
             HollowCylinderObject(
-                f"disc{i}", outer_radius=DISC_RADII[i], inner_radius=DISC_HOLE_RADIUS, height=DISC_HEIGHT / 2, ngeoms=16,
+                f"disc{i}", outer_radius=DISC_RADII[i], inner_radius=DISC_HOLE_RADIUS, height=DISC_HEIGHT / 2, ngeoms=DISC_SIDES,
                 rgba=DISC_COLOURS[i], density=600.0, friction=(1.0, 0.01, 0.001),
             )
             for i in range(self.n_discs)
@@ -150,9 +151,10 @@ class HanoiScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no typ
         super()._reset_internal()
         self.place_pegs(self.base_angle)
         x, y = self.peg_xy[self.start_peg]
+        facing = [np.cos(self.base_angle / 2), 0.0, 0.0, np.sin(self.base_angle / 2)]  # a flat side towards the fingers
         for level, disc in enumerate(reversed(self.discs)):
             z = TABLE_HEIGHT + (level + 0.5) * DISC_HEIGHT
-            self.sim.data.set_joint_qpos(disc.joints[0], np.array([x, y, z, 1.0, 0.0, 0.0, 0.0]))
+            self.sim.data.set_joint_qpos(disc.joints[0], np.array([x, y, z, *facing]))
         context = self.sim._render_context_offscreen
         if context is not None:
             context.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0  # two to three times faster, and no change worth seeing

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vilp_data.engine import map_unordered
+from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import EPISODE_RECORD, EpisodeRecorder
 from vilp_data.sources import open_log
@@ -54,14 +54,19 @@ class _Job:
 
 
 def record_task(
-    spec: TaskSpec, out_dir: Path, *, episodes: int, first_seed: int, workers: int = 1,
-    progress: Callable[[RecordedEpisode], None] | None = None,
-) -> list[RecordedEpisode]:  # fmt: skip
+    spec: TaskSpec,
+    out_dir: Path,
+    *,
+    episodes: int,
+    first_seed: int,
+    workers: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> list[RecordedEpisode]:
     """Record one episode for each of `episodes` seeds from `first_seed` on, into `out_dir/<task>-seed0000007.mcap`.
 
     A finished log of the same seed and options is kept; anything unfinished is made again. Failures of the expert are written too,
-    with success "false" in their metadata. `spec.sim.options` go to the environment. `progress` hears of each episode as it
-    is done, the kept ones first; the list returned is in order of seed.
+    with success "false" in their metadata. `spec.sim.options` go to the environment. `workers` 0 means one process
+    for each core. `progress` is called with the number of episodes newly done; the list returned is in order of seed.
 
     Raises UsageError where the task has no scripted expert, the simulator is not installed, or a log in `out_dir` was made with
     other options.
@@ -74,14 +79,13 @@ def record_task(
     done = {job.seed: kept for job in jobs if (kept := _finished(job)) is not None}
     todo = [job for job in jobs if job.seed not in done]
     if progress is not None:
-        for kept in done.values():
-            progress(kept)
+        progress(len(done))
     if todo:
         require_simulator(cameras=bool(options.get("cameras", True)))
-    for job, episode in map_unordered(_record_one, todo, workers=workers):
+    for job, episode in map_unordered(_record_one, todo, workers=workers or cpu_count()):
         done[job.seed] = episode
         if progress is not None:
-            progress(episode)
+            progress(1)
     return [done[job.seed] for job in jobs]
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from mcap.records import ChunkIndex
+
 from vilp_data.errors import LogError, nearest
 from vilp_data.sources.mcap_file import McapFile, RawMessage
 from vilp_data.sources.message_decoders import MALFORMED, Decoder, decoder_for
@@ -30,7 +32,8 @@ class McapLog:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = McapFile(path)
-        self._decoders: dict[int, Decoder] = {}
+        self._decoders: dict[tuple[str, int], Decoder] = {}  # by message encoding and schema id
+        self._glanced: tuple[int, list[RawMessage]] | None = None  # place and messages of the chunk last glanced at
 
     def sha256(self) -> str:
         digest = hashlib.sha256()
@@ -85,7 +88,7 @@ class McapLog:
         for chunk in self._file.index.chunks:
             if chunk.message_index_offsets and channel_ids.isdisjoint(chunk.message_index_offsets):
                 continue
-            found = self._file.chunk_messages(chunk, channel_ids, 0, END_OF_TIME_NS)
+            found = [raw for raw in self._glance_at(chunk) if raw.channel_id in channel_ids]
             if found:
                 return [self._decoded(raw) for raw in found[:limit]]
         loose = self._file.messages(channel_ids, 0, END_OF_TIME_NS) if self._file.index.loose else iter(())
@@ -107,15 +110,21 @@ class McapLog:
                 raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, known))
         return {channel_id for channel_id, channel in channels.items() if channel.topic in topics}
 
+    def _glance_at(self, chunk: ChunkIndex) -> list[RawMessage]:
+        """Every message of a chunk; the latest chunk is kept, for most topics are glanced at in the same one."""
+        if self._glanced is None or self._glanced[0] != chunk.chunk_start_offset:
+            found = self._file.chunk_messages(chunk, self._file.index.channels, 0, END_OF_TIME_NS)
+            self._glanced = chunk.chunk_start_offset, found
+        return self._glanced[1]
+
     def _decoder(self, channel_id: int) -> Decoder:
-        if channel_id not in self._decoders:
-            index = self._file.index
-            channel = index.channels[channel_id]
-            schema = index.schemas.get(channel.schema_id)
-            self._decoders[channel_id] = decoder_for(
-                channel.message_encoding, schema, where=f"{self.path}, topic {channel.topic}"
-            )
-        return self._decoders[channel_id]
+        channel = self._file.index.channels[channel_id]
+        key = channel.message_encoding, channel.schema_id
+        if key not in self._decoders:
+            schema = self._file.index.schemas.get(channel.schema_id)
+            where = f"{self.path}, topic {channel.topic}"
+            self._decoders[key] = decoder_for(channel.message_encoding, schema, where=where)
+        return self._decoders[key]
 
     def _decoded(self, raw: RawMessage) -> Message:
         index = self._file.index
