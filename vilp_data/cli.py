@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import typer
 from rich.console import Console
@@ -315,9 +315,15 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, sort_keys=True, default=str))
 
 
+class Advance(Protocol):
+    """Moves a bar to `done`; `total` where it was not known before."""
+
+    def __call__(self, done: int, total: int | None = None) -> None: ...
+
+
 @contextmanager
-def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int, int], None]]:
-    """A bar with count, rate and time left on a terminal; a callback (done, total) moves it."""
+def progress_bar(label: str, total: int | None) -> Iterator[Advance]:
+    """A bar with count, rate and time left, on a terminal; elsewhere nothing."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -329,9 +335,9 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int, int],
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=total, rate="")
 
-        def advance(done: int, of: int) -> None:
+        def advance(done: int, total: int | None = None) -> None:
             speed = bar.tasks[task].speed
-            bar.update(task, completed=done, total=of, rate=f"{speed:.2f}/s" if speed else "")
+            bar.update(task, completed=done, total=total, rate=f"{speed:.2f}/s" if speed else "")
 
         yield advance
 

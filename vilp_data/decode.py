@@ -249,13 +249,17 @@ def decode_vector(message: Message, fields: Sequence[str] = (), names: Sequence[
 def compile_fields(fields: tuple[str, ...], names: tuple[str, ...] = ()) -> VectorReader:
     """`decode_vector` for one topic, its paths parsed once: message -> float64 [D]. DecodeError where a path is malformed."""
     paths = [(path, _parse_path(path)) for path in fields]
+    orders: dict[tuple[str, ...], list[int]] = {}  # by the names that a message lists
 
     def read(message: Message) -> F64:
         chosen = paths or [(path, _parse_path(path)) for path in _default_fields(message)]
         parts = [_numbers(message, path, _follow(message, path, steps)) for path, steps in chosen]
         if names:
-            order = _order(message, names)
-            parts = [_reordered(message, path, part, order) for (path, _), part in zip(chosen, parts, strict=True)]
+            published = _published_names(message)
+            if published not in orders:
+                orders[published] = _order(message, published, names)
+            for number, (path, _) in enumerate(chosen):
+                parts[number] = _reordered(message, path, parts[number], orders[published], len(published))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     return read
@@ -336,35 +340,25 @@ def _numbers(message: Message, path: str, value: Any) -> F64:
     return array.astype(np.float64).ravel()
 
 
-def _published_names(message: Message) -> list[str]:
+def _published_names(message: Message) -> tuple[str, ...]:
     joints = _member(message.body, "joints", None)
-    return [str(name) for name in (_member(message.body, "name", ()) if joints is None else _get(joints, "name"))]
+    return tuple(_member(message.body, "name", ()) if joints is None else _get(joints, "name"))
 
 
-def _order(message: Message, names: tuple[str, ...]) -> list[int]:
-    published = _published_names(message)
+def _order(message: Message, published: tuple[str, ...], names: tuple[str, ...]) -> list[int]:
     if not published:
-        raise _cannot(
-            message,
-            "the task picks by name, but the message has no list `name`",
-            message.schema,
-            "use indices: position[0:7]",
-        )
+        remedy = "use indices: position[0:7]"
+        raise _cannot(message, "the task picks by name, but the message has no list `name`", message.schema, remedy)
     for name in names:
         if name not in published:
             raise _cannot(message, f"no joint {name!r}", None, nearest(name, published))
     return [published.index(name) for name in names]
 
 
-def _reordered(message: Message, path: str, part: F64, order: list[int]) -> F64:
-    n_names = len(_published_names(message))
+def _reordered(message: Message, path: str, part: F64, order: list[int], n_names: int) -> F64:
     if len(part) != n_names:
-        raise _cannot(
-            message,
-            f"field {path!r} is not parallel to `name`",
-            f"{len(part)} values, {n_names} names",
-            "leave `names` or slices out",
-        )
+        found = f"{len(part)} values, {n_names} names"
+        raise _cannot(message, f"field {path!r} is not parallel to `name`", found, "leave `names` or slices out")
     return part[order]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -99,7 +100,7 @@ class EpisodeStore:
 
     def write_spec(self, spec: TaskSpec) -> None:
         table = {"format": FORMAT_VERSION, "spec": spec.model_dump(mode="json", by_alias=True)}
-        data = (json.dumps(table, indent=2, sort_keys=True) + "\n").encode()
+        data = (json.dumps(table, indent=2) + "\n").encode()  # never sorted: the order of action and low_dim parts is the order of columns
         path = self.root / "dataset.json"
         if not path.is_file() or path.read_bytes() != data:
             shards.write_atomic(path, data)
@@ -246,8 +247,14 @@ def _to_row(entry: EpisodeEntry, file_bytes: int) -> dict[str, Any]:
     return {key: json.dumps(value, sort_keys=True) if key in _JSON_FIELDS else value for key, value in row.items()}
 
 
+@lru_cache(maxsize=4096)
+def _parsed(text: str) -> Any:
+    """JSON, parsed once for all the episodes that share it (every one its ingest spec). Read-only by agreement."""
+    return json.loads(text)
+
+
 def _from_row(row: Mapping[str, Any]) -> EpisodeEntry:
-    parsed = {key: json.loads(row[key]) for key in _JSON_FIELDS}
+    parsed = {key: _parsed(row[key]) for key in _JSON_FIELDS}
     return EpisodeEntry(
         **{key: row[key] for key in ("id", "source", "source_sha256", "source_episode", "key", "outcome", "content_sha256")},
         ingest=parsed["ingest"], tags=parsed["tags"], findings=tuple(parsed["findings"]),

@@ -96,7 +96,9 @@ def _sampled(complete: bool, times: dict[str, I64], start_ns: int | None) -> tup
     glance = f"image and header columns: the first {GLANCE} messages of each topic at most"
     if complete or start_ns is None:
         return (glance,)
-    covered_s = (max(int(values.max()) for values in times.values() if len(values)) - start_ns) / 1e9
+    covered_s = (
+        max((int(values.max()) for values in times.values() if len(values)), default=start_ns) - start_ns
+    ) / 1e9
     return (f"rates and gaps: the first {covered_s:.0f} s", glance)
 
 

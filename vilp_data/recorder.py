@@ -84,11 +84,15 @@ class EpisodeRecorder:
 
     def __enter__(self) -> Self:
         file = self._stack.enter_context(atomic_file(self._path))
-        self._writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
+        self._writer = Writer(
+            file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
+        )
         self._writer.start(profile="", library=f"vilp {version('vilp')}")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         with self._stack.pop_all() as stack:
             if error is not None:
                 stack.__exit__(kind, error, trace)  # the temporary file goes, and the exception goes on
@@ -99,7 +103,9 @@ class EpisodeRecorder:
 
     # --- one method for each kind of message ---
 
-    def image(self, topic: str, stamp_ns: int, rgb: U8, *, frame_id: str = "", latency: Latency = CAMERA_LATENCY) -> None:
+    def image(
+        self, topic: str, stamp_ns: int, rgb: U8, *, frame_id: str = "", latency: Latency = CAMERA_LATENCY
+    ) -> None:
         """uint8 [H,W,3] RGB, top row first, as JPEG."""
         if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
             raise UsageError("an image is uint8 [H,W,3] RGB", where=topic, found=f"{rgb.dtype} {rgb.shape}")
@@ -117,15 +123,31 @@ class EpisodeRecorder:
         self._send_ros(topic, "sensor_msgs/msg/JointState", stamp_ns, {"header": _header(stamp_ns), **fields}, latency)
 
     def pose(
-        self, topic: str, stamp_ns: int, position: Vector, quaternion_xyzw: Vector, *, frame_id: str, latency: Latency = SENSOR_LATENCY
+        self,
+        topic: str,
+        stamp_ns: int,
+        position: Vector,
+        quaternion_xyzw: Vector,
+        *,
+        frame_id: str,
+        latency: Latency = SENSOR_LATENCY,
     ) -> None:
         """geometry_msgs/msg/PoseStamped: metres and a unit quaternion in `frame_id`."""
-        pose = _ros("geometry_msgs/msg/Pose", position=_xyz("Point", position), orientation=_quaternion(quaternion_xyzw))
+        pose = _ros(
+            "geometry_msgs/msg/Pose", position=_xyz("Point", position), orientation=_quaternion(quaternion_xyzw)
+        )
         fields = {"header": _header(stamp_ns, frame_id), "pose": pose}
         self._send_ros(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, fields, latency)
 
     def twist(
-        self, topic: str, stamp_ns: int, linear: Vector, angular: Vector, *, frame_id: str, latency: Latency = SENSOR_LATENCY
+        self,
+        topic: str,
+        stamp_ns: int,
+        linear: Vector,
+        angular: Vector,
+        *,
+        frame_id: str,
+        latency: Latency = SENSOR_LATENCY,
     ) -> None:
         """geometry_msgs/msg/TwistStamped, in `frame_id`."""
         twist = _ros("geometry_msgs/msg/Twist", linear=_xyz("Vector3", linear), angular=_xyz("Vector3", angular))
@@ -135,7 +157,9 @@ class EpisodeRecorder:
     def vector(self, topic: str, stamp_ns: int, data: Vector, *, latency: Latency = NO_LATENCY) -> None:
         """std_msgs/msg/Float64MultiArray. It has no header: its log time is its time, so by default it has no latency."""
         layout = _ros("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-        self._send_ros(topic, "std_msgs/msg/Float64MultiArray", stamp_ns, {"layout": layout, "data": _f64(data)}, latency)
+        self._send_ros(
+            topic, "std_msgs/msg/Float64MultiArray", stamp_ns, {"layout": layout, "data": _f64(data)}, latency
+        )
 
     # --- the file ---
 
@@ -156,7 +180,9 @@ class EpisodeRecorder:
         """Write what is due: log times before `before_ns`, or everything."""
         while self._pending and (before_ns is None or self._pending[0][0] < before_ns):
             log_time_ns, channel_id, sequence, message = heapq.heappop(self._pending)
-            self._writer.add_message(channel_id, log_time_ns, message.data, publish_time=message.publish_time_ns, sequence=sequence)
+            self._writer.add_message(
+                channel_id, log_time_ns, message.data, publish_time=message.publish_time_ns, sequence=sequence
+            )
 
     def _channel(self, topic: str, schema: str) -> _Channel:
         if topic not in self._channels:
@@ -166,13 +192,18 @@ class EpisodeRecorder:
             self._channels[topic] = _Channel(identity, schema, delays)
         channel = self._channels[topic]
         if channel.schema != schema:
-            raise UsageError("a topic carries one kind of message", where=topic, found=f"{channel.schema}, then {schema}")
+            raise UsageError(
+                "a topic carries one kind of message", where=topic, found=f"{channel.schema}, then {schema}"
+            )
         return channel
 
     def _schema(self, name: str) -> int:
         if name not in self._schemas:
             if name == _IMAGE_SCHEMA:
-                encoding, definition = "protobuf", build_file_descriptor_set(CompressedImage).SerializeToString(deterministic=True)
+                encoding, definition = (
+                    "protobuf",
+                    build_file_descriptor_set(CompressedImage).SerializeToString(deterministic=True),
+                )
             else:
                 encoding, definition = "ros2msg", _ROS.generate_msgdef(name, ros_version=2)[0].encode()
             self._schemas[name] = self._writer.register_schema(name, encoding, definition)
@@ -204,7 +235,11 @@ def _ros(schema: str, **fields: Any) -> Any:
 
 def _header(stamp_ns: int, frame_id: str = "") -> Any:
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    return _ros("std_msgs/msg/Header", stamp=_ros("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
+    return _ros(
+        "std_msgs/msg/Header",
+        stamp=_ros("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds),
+        frame_id=frame_id,
+    )
 
 
 def _xyz(kind: str, values: Vector) -> Any:

@@ -13,7 +13,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -30,9 +30,10 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import LogError, StoreError, UsageError, nearest
 from vilp_data.latents import BATCH, FrameEncoder, latents_path, stale_reason
 from vilp_data.numeric_fields import numeric_series
+from vilp_data.plots import Plot, frame_psnr, panel_rank, vector_parts
 from vilp_data.sources import open_log
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.types import F32, F64, I32, I64, U8, LogEpisode, LogReader, Message
+from vilp_data.types import F32, I32, I64, U8, LogEpisode, LogReader, Message
 from vilp_data.viewer_process import (
     LOCALHOST,
     POLL_S,
@@ -55,9 +56,13 @@ MAX_TABS = 8
 TIMEOUT_S = 60.0
 SETTLE_S = 1.0  # the picture must not change for this long
 LINE_WIDTH = 1.5
-COLOURS = (0xFF6B6BFF, 0x4FC36CFF, 0x5B9DFFFF, 0xFFC857FF, 0xC58BFFFF, 0x4DD8D8FF, 0xFF9F5AFF, 0xF58FC6FF, 0xB5C06AFF, 0xBFC7D5FF)
-COMMAND_WORDS = ("action", "command", "cmd", "target", "desired")
-STATE_WORDS = ("joint", "pose", "gripper", "state")
+COLOURS = np.array(
+    [
+        *([255, 107, 107], [79, 195, 108], [91, 157, 255], [255, 200, 87], [197, 139, 255]),
+        *([77, 216, 216], [255, 159, 90], [245, 143, 198], [181, 192, 106], [191, 199, 213]),
+    ],
+    np.uint8,
+)
 
 Moment = dict[str, np.datetime64 | np.timedelta64]
 Say = Callable[[str], None]
@@ -75,26 +80,6 @@ class Drawn:
 
 
 Draw = Callable[[Path], Drawn]
-
-
-@dataclass
-class Plot:
-    """One time series panel: the values of each series over time, NaN where a message lacked one."""
-
-    title: str
-    entity: str
-    names: list[str] = field(default_factory=list)
-    times_ns: list[int] = field(default_factory=list)
-    rows: list[list[float]] = field(default_factory=list)
-
-    def add(self, time_ns: int, values: Mapping[str, float]) -> None:
-        self.names += [name for name in values if name not in self.names]
-        self.times_ns.append(time_ns)
-        self.rows.append([values.get(name, np.nan) for name in self.names])
-
-    def table(self) -> F64:
-        """float64 [n, series]."""
-        return np.array([row + [np.nan] * (len(self.names) - len(row)) for row in self.rows], np.float64)
 
 
 # --- drawing a log ----------------------------------------------------------------------------------------------------
@@ -123,7 +108,7 @@ def draw_log(
                 raise LogError("nothing to draw", where=log_path, found="no images and no numbers", remedy=remedy)
             commands = {part.topic for part in spec.action.values() if part.topic} if spec else set()
             canvas.plots(plot for panel in plots.values() for plot in panel.values())
-            ranked = sorted(plots, key=lambda topic: (_rank(topic, commands), topic))
+            ranked = sorted(plots, key=lambda topic: (panel_rank(topic, commands), topic))
             views = [rrb.Spatial2DView(origin=_entity(topic), name=_title(topic)) for topic in cameras]
             canvas.layout([rrb.Horizontal(*views)] if views else [], [list(plots[topic].values()) for topic in ranked])
         return Drawn(rrd, canvas.id, canvas.moment((chosen.start_ns + chosen.end_ns) // 2), notes)
@@ -164,18 +149,6 @@ def _plot_message(panel: dict[str, Plot], message: Message) -> None:
         if group not in panel:
             panel[group] = Plot(_title(message.topic, group), _entity(message.topic, group))
         panel[group].add(message.log_time_ns, values)
-
-
-def _rank(topic: str, commands: set[str]) -> int:
-    """Order of panels: what the task calls an action, what is named like one, joints and poses, the rest."""
-    name = topic.lower()
-    if topic in commands:
-        return 0
-    if any(word in name for word in COMMAND_WORDS):
-        return 1
-    known = [rank for rank, word in enumerate(STATE_WORDS, start=2) if word in name]
-    # Simulator state is for replaying, and says little in a plot.
-    return known[0] if known and "sim" not in name.split("/") else 2 + len(STATE_WORDS)
 
 
 # --- drawing an ingested episode --------------------------------------------------------------------------------------
@@ -245,40 +218,13 @@ def _draw_reconstruction(canvas: Canvas, view: str, real: U8, rebuilt: U8, times
     return plot
 
 
-def frame_psnr(real: U8, rebuilt: U8) -> F64:
-    """Peak signal to noise ratio of each frame in dB, float64 [n], of uint8 [n,H,W,3] against [n,H,W,3]; NaN for equal frames."""
-    squared = (real.astype(np.float32) - rebuilt) ** 2
-    error = squared.mean(axis=(1, 2, 3), dtype=np.float64)
-    return 10 * np.log10(255.0**2 / np.where(error > 0, error, np.nan))
-
-
-def _vector_plots(
-    kind: str, values: F32, parts: Mapping[str, ActionSpec | VectorSpec], log_time_ns: I64
-) -> list[list[Plot]]:
-    """One plot for each part of a stored vector, so that metres and radians keep their own scales."""
-    labels = {name: _part_labels(part, parts) for name, part in parts.items()}
-    if sum(map(len, labels.values())) != values.shape[1]:  # a part takes whatever its messages hold: widths are not in the spec
-        labels = {"": [str(index) for index in range(values.shape[1])]}
-    panels, start = [], 0
-    for name, columns in labels.items():
-        plot = Plot(_title(kind, name), _entity(kind, name), columns)
-        plot.times_ns = log_time_ns.tolist()
-        plot.rows = values[:, start : start + len(columns)].tolist()
-        start += len(columns)
-        panels.append([plot] if columns else [])
-    return [panel for panel in panels if panel]
-
-
-def _part_labels(part: ActionSpec | VectorSpec, parts: Mapping[str, ActionSpec | VectorSpec]) -> list[str]:
-    """A label for each value of a part, as far as the spec tells: `x`, `y`, or the index within a slice."""
-    labels: list[str] = []
-    for path in part.fields:
-        start, colon, stop = path.rpartition("[")[2].rstrip("]").partition(":")
-        if colon:
-            labels += [str(index) for index in range(int(start), int(stop))]
-        else:
-            labels.append(path.rpartition(".")[2])
-    return list(part.names) if part.names and len(labels) <= 1 else labels
+def _vector_plots(kind: str, values: F32, parts: Mapping[str, ActionSpec | VectorSpec], log_time_ns: I64) -> list[list[Plot]]:
+    """One panel for each part of a stored vector, so that metres and radians keep their own scales."""
+    times = log_time_ns.tolist()
+    return [
+        [Plot(_title(kind, name), _entity(kind, name), labels, times, columns.tolist())]
+        for name, (labels, columns) in vector_parts(values, parts).items()
+    ]
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -322,7 +268,7 @@ class Canvas:
 
     def plots(self, plots: Iterator[Plot]) -> None:
         for plot in plots:
-            colours = [COLOURS[number % len(COLOURS)] for number in range(len(plot.names))]
+            colours = COLOURS[np.arange(len(plot.names)) % len(COLOURS)]
             lines = rr.SeriesLines(names=plot.names, colors=colours, widths=LINE_WIDTH)
             self._recording.log(plot.entity, lines, static=True)
             times = self._index(np.array(plot.times_ns, np.int64))
@@ -365,7 +311,7 @@ class Canvas:
         """A time axis over all that was drawn, the same for all plots."""
         if not times_ns:
             return None
-        ends = [rrb.TimeRangeBoundary.absolute(**self.moment(time_ns)) for time_ns in (min(times_ns), max(times_ns))]
+        ends = [rrb.TimeRangeBoundary.absolute(nanos=time_ns) for time_ns in (min(times_ns), max(times_ns))]
         return rrb.TimeAxis(view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
 
     def _index(self, times_ns: npt.NDArray[Any]) -> rr.TimeColumn:

@@ -113,6 +113,11 @@ def read_state(run: Path) -> RunState | None:
     return _state(_header(run)) if (run / FILE).is_file() else None
 
 
+def checkpoint_digest(run: Path) -> str:
+    """SHA-256 of the run's checkpoint as recorded in its header: changes with any weight, the recipe or the state."""
+    return _header(run)["sha256"]
+
+
 def _header(run: Path) -> dict[str, str]:
     metadata = read_header(run / FILE).metadata
     found = metadata.get("format", "no format")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +15,13 @@ from vilp_data.errors import SplitError, UsageError, nearest
 from vilp_data.latents import BATCH, encode_batches, latents_path, stale_reason
 from vilp_data.shards import open_shard, read_shard
 from vilp_data.types import F16, I64, U8
-from vilp_models.checkpoint import read_state, run_for_view
+from vilp_models.checkpoint import checkpoint_digest, read_state, run_for_view
 from vilp_models.lpips import Lpips, load_lpips
 from vilp_models.metrics import lpips_distance, moving_mask, psnr_from_mse, squared_error, temporal_median
 from vilp_models.vqgan import VqganEncoder, load_frame_encoder
+
+REPORT_FORMAT = 1
+"""Raised when the same inputs give other numbers."""
 
 ENOUGH_DB = 6.0
 """Moving pixels must be at least this much better than the mean training frame gives."""
@@ -88,16 +92,16 @@ class PrecisionCost:
 
 @dataclass(frozen=True)
 class EpisodeFidelity:
-    """One view of one episode. The baselines predict each frame by the mean training frame, by the episode's first
-    frame, and by the frame before."""
+    """One view of one episode. `vqgan` is its reconstruction. The baselines put in place of each frame the mean
+    training frame, a copy of the episode's first frame, and the frame before."""
 
     episode: str
     view: str
     frames: int
     lpips: float
-    reconstruction: Errors
+    vqgan: Errors
     mean_frame: Errors
-    first_frame: Errors
+    copy: Errors
     previous_frame: Errors
 
 
@@ -125,7 +129,7 @@ class ViewFidelity:
     worst: tuple[WorstFrame, ...]
 
     def total(self, name: str) -> Errors:
-        """Errors of `reconstruction` or a baseline, pooled over episodes."""
+        """Errors of `vqgan` or of a baseline, pooled over episodes."""
         return sum((getattr(episode, name) for episode in self.episodes), Errors())
 
     @property
@@ -146,16 +150,16 @@ class ViewFidelity:
     @property
     def gain_db(self) -> float:
         """Moving pixels: reconstruction above the mean training frame. NaN where nothing moves."""
-        return self.total("reconstruction").moving_psnr - self.total("mean_frame").moving_psnr
+        return self.total("vqgan").moving_psnr - self.total("mean_frame").moving_psnr
 
     @property
     def warning(self) -> str | None:
         """Why no planner should be trained on this view, or None."""
-        if self.total("reconstruction").moving_count == 0:
+        if self.total("vqgan").moving_count == 0:
             return f"do not train a planner on this: nothing moves in view {self.view!r}; is the camera stuck?"
         if self.gain_db >= ENOUGH_DB:
             return None
-        reached = self.total("reconstruction").moving_psnr
+        reached = self.total("vqgan").moving_psnr
         return (
             f"do not train a planner on this: moving pixels of view {self.view!r} reconstruct at {reached:.1f} dB, "
             f"{self.gain_db:+.1f} dB against the mean training frame (wanted: {ENOUGH_DB:+.0f} at least); "
@@ -207,6 +211,17 @@ def fidelity_report(
             _measure_view(store, encoder, perceptual, view, [entries[e] for e in sorted(episodes)], mean, progress)
         )
     return FidelityReport(tuple(measured), "alex")
+
+
+def report_inputs(store: EpisodeStore, run_dir: Path, episodes: Sequence[str]) -> dict[str, Any]:
+    """All that a report depends on, as plain data: a report written with equal inputs need not be made again."""
+    entries = {entry.id: entry for entry in store.index()}
+    views = sorted(store.spec().views)
+    return {
+        "format": REPORT_FORMAT,
+        "checkpoints": {view: checkpoint_digest(run_for_view(run_dir, view)) for view in views},
+        "frames": {e: {view: entries[e].frames_sha256[view] for view in views} for e in sorted(episodes)},
+    }
 
 
 def mean_frame(store: EpisodeStore, episodes: Sequence[str], view: str) -> U8:
@@ -283,9 +298,9 @@ def _measure_episode(episode: str, view: str, frames: U8, decoded: U8, mean: U8,
         view=view,
         frames=len(frames),
         lpips=distance,
-        reconstruction=errors_between(frames, decoded, moving),
+        vqgan=errors_between(frames, decoded, moving),
         mean_frame=errors_between(frames, mean, moving),
-        first_frame=errors_between(frames, frames[0], moving),
+        copy=errors_between(frames, frames[0], moving),
         previous_frame=errors_between(frames[1:], frames[:-1], moving[1:]),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +25,36 @@ from vilp_models.fidelity import (
 from vilp_models.lpips_weights import FILES
 from vilp_models.metrics import MOVING_THRESHOLD, psnr_from_mse
 
-BASELINES = ("mean_frame", "first_frame", "previous_frame")
+MEASURED = ("vqgan", "mean_frame", "copy", "previous_frame")
+"""Whose errors a report holds, by the names of EpisodeFidelity."""
+
 ERROR_GAIN = 4
 SCALE = 2
 CAPTION_HEIGHT = 18
 
 
-def write_report(report: FidelityReport, folder: Path) -> list[Path]:
-    """Write the three files into `folder` and return their paths. Raises StoreError where it cannot be written."""
+def write_report(report: FidelityReport, folder: Path, inputs: Mapping[str, Any]) -> list[Path]:
+    """Write the three files into `folder`, report.json with its `inputs` last, and return their paths.
+
+    Raises StoreError where they cannot be written."""
+    table = {"inputs": inputs, **to_table(report)}
     files = {
-        "report.json": json.dumps(to_table(report), indent=2, allow_nan=False).encode() + b"\n",
-        "report.md": to_markdown(report).encode(),
         "worst.png": to_png(contact_sheet([frame for view in report.views for frame in view.worst])),
+        "report.md": to_markdown(report).encode(),
+        "report.json": json.dumps(table, indent=2, allow_nan=False).encode() + b"\n",
     }
     for name, data in files.items():
         write_atomic(folder / name, data)
     return [folder / name for name in files]
+
+
+def read_fresh_report(folder: Path, inputs: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The report.json in `folder` if it was made from equal `inputs` (see `report_inputs`), else None."""
+    try:
+        table: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
+    return table if table.get("inputs") == inputs else None
 
 
 def to_table(report: FidelityReport) -> dict[str, Any]:
@@ -61,13 +75,13 @@ def to_markdown(report: FidelityReport) -> str:
         ["# VQGAN fidelity on validation episodes"],
         warnings,
         _table(
-            "view | frames | PSNR | LPIPS | moving | mean frame | gain | first frame | previous frame | codes used",
+            "view | frames | PSNR | LPIPS | moving | mean frame | gain | copy | previous frame | codes used",
             [_view_cells(view) for view in report.views],
         ),
         [
             "PSNR in dB; from *moving* on over moving pixels alone, which are more than",
             f"{MOVING_THRESHOLD} of 255 from the episode's temporal median. LPIPS with {report.lpips_network}.",
-            "The baselines repeat the mean training frame, the episode's first frame, and the frame before.",
+            "The baselines repeat the mean training frame, the episode's first frame (copy), and the frame before.",
         ],
         _table(
             "view | encoder key | largest error | codes that flip | PSNR change", map(_precision_cells, report.views)
@@ -109,21 +123,21 @@ def _view_table(view: ViewFidelity) -> dict[str, Any]:
     return {
         "encoder_key": view.key,
         "lpips": view.lpips,
-        "reconstruction": _errors_table(view.total("reconstruction")),
-        "baselines": {name: _errors_table(view.total(name)) for name in BASELINES},
-        "moving_gain_db": _number(view.gain_db),
-        "codes": {"size": len(view.code_counts), "used": view.codes_used, "perplexity": view.code_perplexity},
+        **{name: _errors_table(view.total(name)) for name in MEASURED},
+        "moving_gain": _number(view.gain_db),
+        "codes": len(view.code_counts),
+        "codes_used": view.codes_used,
+        "code_perplexity": view.code_perplexity,
         "float16": {
             "max_latent_error": view.precision.max_error,
             "codes_flipped_share": view.precision.flipped_share,
-            "psnr_change_db": _number(view.precision.psnr_change),
+            "psnr_change": _number(view.precision.psnr_change),
         },
         "episodes": {
             e.episode: {
                 "frames": e.frames,
                 "lpips": e.lpips,
-                "reconstruction": _errors_table(e.reconstruction),
-                "baselines": {name: _errors_table(getattr(e, name)) for name in BASELINES},
+                **{name: _errors_table(getattr(e, name)) for name in MEASURED},
             }
             for e in view.episodes
         },
@@ -132,8 +146,8 @@ def _view_table(view: ViewFidelity) -> dict[str, Any]:
 
 def _errors_table(errors: Errors) -> dict[str, float | int | None]:
     return {
-        "psnr_db": _number(errors.psnr),
-        "moving_psnr_db": _number(errors.moving_psnr),
+        "psnr": _number(errors.psnr),
+        "moving_psnr": _number(errors.moving_psnr),
         "moving_pixels": errors.moving_count,
     }
 
@@ -147,7 +161,7 @@ def _db(value: float) -> str:
 
 
 def _view_cells(view: ViewFidelity) -> list[str]:
-    real, mean, first, previous = (view.total(name) for name in ("reconstruction", *BASELINES))
+    real, mean, first, previous = (view.total(name) for name in MEASURED)
     codes = f"{view.codes_used} of {len(view.code_counts)} (perplexity {view.code_perplexity:.0f})"
     moving = [_db(errors.moving_psnr) for errors in (real, mean, first, previous)]
     frames = sum(episode.frames for episode in view.episodes)
@@ -162,7 +176,7 @@ def _precision_cells(view: ViewFidelity) -> list[str]:
 
 
 def _episode_cells(episode: EpisodeFidelity) -> list[str]:
-    real = episode.reconstruction
+    real = episode.vqgan
     numbers = [_db(real.psnr), f"{episode.lpips:.4f}", _db(real.moving_psnr), _db(episode.mean_frame.moving_psnr)]
     return [episode.episode, episode.view, str(episode.frames), *numbers]
 

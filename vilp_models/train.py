@@ -64,8 +64,7 @@ def train_vqgan(
 
     A finished run with this recipe is left alone; an unfinished one goes on exactly where it stopped. Returns where each
     run ended. Raises UsageError where a run in `run_dir` has another recipe, or an unfinished one other episodes
-    (`restart` begins those anew), DivergedError where a loss stops being finite, KeyboardInterrupt after saving on
-    Ctrl-C.
+    (`restart` begins those anew), DivergedError where a loss stops being finite, KeyboardInterrupt on Ctrl-C, saved.
     """
     store = EpisodeStore(dataset_dir)
     keys = {entry.id: entry.key for entry in store.index()}

@@ -14,8 +14,8 @@ from vilp_data.errors import SplitError
 from vilp_data.latents import latents_path
 from vilp_data.shards import write_shard
 from vilp_data.spec import TaskSpec
-from vilp_models.fidelity import Errors, FidelityReport, errors_between, fidelity_report, mean_frame
-from vilp_models.fidelity_page import contact_sheet, write_report
+from vilp_models.fidelity import Errors, FidelityReport, errors_between, fidelity_report, mean_frame, report_inputs
+from vilp_models.fidelity_page import contact_sheet, read_fresh_report, write_report
 from vilp_models.train import train_vqgan
 from vilp_models.vqgan import load_frame_encoder
 
@@ -44,7 +44,7 @@ def test_what_the_report_counts(report: FidelityReport) -> None:
     assert view.code_counts.sum() == 2 * STEPS * 8 * 12
     assert 1 <= view.code_perplexity <= view.codes_used
     assert view.precision.max_error < 0.01
-    assert view.total("reconstruction").moving_count == view.total("mean_frame").moving_count > 0
+    assert view.total("vqgan").moving_count == view.total("mean_frame").moving_count > 0
 
 
 def test_stored_latents_are_what_is_decoded(store: EpisodeStore, run_dir: Path, report: FidelityReport) -> None:
@@ -56,7 +56,7 @@ def test_stored_latents_are_what_is_decoded(store: EpisodeStore, run_dir: Path, 
     write_shard(path, {"latents": np.full(shape, 3.0, np.float16)}, header)
     with_stored = fidelity_report(store, run_dir, ["c"], views=["front"])
     assert with_stored.views[0].codes_used == 1
-    assert with_stored.views[0].episodes[0].reconstruction != report.views[0].episodes[0].reconstruction
+    assert with_stored.views[0].episodes[0].vqgan != report.views[0].episodes[0].vqgan
 
 
 def test_validating_on_training_episodes_is_refused(store: EpisodeStore, run_dir: Path) -> None:
@@ -80,11 +80,9 @@ def test_errors_add_up_to_those_of_everything_at_once() -> None:
 
 
 def test_the_report_is_written_for_programs_people_and_eyes(report: FidelityReport, tmp_path: Path) -> None:
-    write_report(report, tmp_path / "report")
+    write_report(report, tmp_path / "report", {"made": "from these"})
     table = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert table["views"]["front"]["reconstruction"]["psnr_db"] == pytest.approx(
-        report.views[0].total("reconstruction").psnr, abs=1e-3
-    )
+    assert table["views"]["front"]["vqgan"]["psnr"] == pytest.approx(report.views[0].total("vqgan").psnr, abs=1e-3)
     page = (tmp_path / "report" / "report.md").read_text()
     assert "**Warning:** do not train a planner" in page
     assert page.count("| c |") == 2
@@ -99,3 +97,19 @@ def test_the_sheet_shows_real_reconstructed_and_amplified_error(report: Fidelity
     assert np.array_equal(row[::2, 96:192:2], frame.reconstructed)
     error = np.abs(frame.real.astype(int) - frame.reconstructed.astype(int))
     assert np.array_equal(row[::2, 192::2], np.minimum(4 * error, 255))
+
+
+def test_a_report_is_fresh_until_a_checkpoint_or_the_episodes_change(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path, report: FidelityReport, tmp_path: Path
+) -> None:
+    inputs = report_inputs(store, run_dir, ["c", "d"])
+    folder = tmp_path / "report"
+    assert read_fresh_report(folder, inputs) is None
+    write_report(report, folder, inputs)
+    table = read_fresh_report(folder, report_inputs(store, run_dir, ["d", "c"]))
+    assert table is not None
+    assert table["warnings"] == report.warnings
+    assert read_fresh_report(folder, report_inputs(store, run_dir, ["c"])) is None
+    recipe = tiny_recipe(share_views=True, seed=1)
+    train_vqgan(store.root, spec, recipe, run_dir, train_episodes=["a"], split_hash="s", restart=True, show=False)
+    assert read_fresh_report(folder, report_inputs(store, run_dir, ["c", "d"])) is None

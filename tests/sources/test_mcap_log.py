@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from tests.real_data import real_data
-from tests.synthetic import ACTION_TOPIC, HEADER_LAG_NS, JOINT_TOPIC, START_NS, Encoding, image_topic, write_mcap
+from tests.synthetic import ACTION_TOPIC, HEADER_LAG_NS, JOINT_TOPIC, START_NS, STORE, Encoding, image_topic, write_mcap
 from vilp_data.decode import decode_vector
 from vilp_data.errors import LogError
 from vilp_data.sources import open_log
@@ -270,6 +270,53 @@ def test_bytes_that_do_not_fit_their_schema_name_topic_and_time(tmp_path: Path) 
     assert len(read(path, ["/t"])) == 1
     with pytest.raises(LogError, match="a message of /bad at 77 ns does not fit its schema"):
         read(path, ["/bad"])
+
+
+def write_cdr(path: Path, schema: tuple[str, str, bytes], data: bytes) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        writer.add_message(writer.register_channel("/t", "cdr", writer.register_schema(*schema)), 1, data, 1)
+        writer.finish()
+    return path
+
+
+POINT_IDL = b"""module geometry_msgs { module msg { struct Point { double x; double y; double z; }; }; };"""
+POINT_CDR = bytes(STORE.serialize_cdr(STORE.types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0), "geometry_msgs/msg/Point"))
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        ("geometry_msgs/msg/Point", "ros2msg", b"float64 x\nfloat64 y\nfloat64 z\n"),
+        ("geometry_msgs/Point", "ros2msg", b"float64 x\nfloat64 y\nfloat64 z\n"),
+        ("geometry_msgs/msg/Point", "ros2idl", POINT_IDL),
+        ("geometry_msgs/msg/Point", "ros2msg", b""),
+        ("geometry_msgs/msg/Point", "", b""),
+    ],
+    ids=["msg", "short name", "idl", "empty text of a stock type", "no schema of a stock type"],
+)
+def test_every_way_to_describe_a_ros_type_is_understood(tmp_path: Path, schema: tuple[str, str, bytes]) -> None:
+    (message,) = read(write_cdr(tmp_path / "run.mcap", schema, POINT_CDR))
+    assert decode_vector(message, ["x", "y", "z"]).tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        ("my_msgs/msg/Thing", "ros2msg", b"float64 x\nmy_msgs/Other other\n"),
+        ("my_msgs/msg/Thing", "ros2msg", b"this is no definition"),
+        ("my_msgs/msg/Thing", "flatbuffer", b"\x01"),
+        ("my_msgs/msg/Thing", "ros2msg", b"\xff\xfe"),
+    ],
+    ids=["a part is missing", "no definition", "another encoding", "no text"],
+)
+def test_a_schema_that_cannot_be_understood_is_refused_before_the_first_message(
+    tmp_path: Path, schema: tuple[str, str, bytes]
+) -> None:
+    path = write_cdr(tmp_path / "run.mcap", schema, POINT_CDR)
+    with open_log(path) as log, pytest.raises(LogError, match="cannot be understood"):
+        log.messages(["/t"])
 
 
 # --- real logs --------------------------------------------------------------------------------------------------------

@@ -6,8 +6,16 @@ Importing this package needs no simulator. `register()` makes the environments k
 from __future__ import annotations
 
 import importlib.util
+import logging
+import os
+import sys
 
 from vilp_data.errors import UsageError
+
+# Both are read when robosuite is first imported: draw without a display or GPU, and keep its advice on unused robots to itself.
+if sys.platform.startswith("linux"):
+    os.environ.setdefault("MUJOCO_GL", "osmesa")
+logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
 
 ENVIRONMENTS = {
     "vilp/Hanoi-v0": "vilp_data.sims.hanoi:HanoiEnv",

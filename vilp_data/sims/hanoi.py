@@ -52,7 +52,7 @@ class Proprioception:
     gripper_position: F64
 
 
-class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):
+class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gymnasium is not followed
     """Move `n_discs` discs, one at a time, from peg 0 to peg `goal_peg`, never a larger one on a smaller one.
 
     observation  front, side: uint8 [height,width,3] RGB, top row first (absent with cameras=False);
@@ -96,7 +96,9 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):
         self._n_steps = 0
         self._home_quaternion: F64 | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         super().reset(seed=seed)
         state = (options or {}).get("state")
         self.scene.base_angle = float(self.np_random.uniform(np.pi / 4, 3 * np.pi / 4))
@@ -166,9 +168,11 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):
         n_physics = mujoco.mj_stateSize(model, _MUJOCO_STATE)
         if state.shape != (n_physics + 3,):
             raise UsageError(
-                "this state is not from this environment", where="options['state']", found=f"shape {state.shape}, expected ({n_physics + 3},)",
+                "this state is not from this environment",
+                where="options['state']",
+                found=f"shape {state.shape}, expected ({n_physics + 3},)",
                 remedy=f"make the environment with the options of the recording (now n_discs={self.n_discs})",
-            )  # fmt: skip
+            )
         self.scene.place_pegs(float(state[-1]))
         mujoco.mj_setState(model, data, state[:n_physics], _MUJOCO_STATE)
         self.scene.robots[0].gripper["right"].current_action = state[n_physics : n_physics + 2].copy()
@@ -219,7 +223,8 @@ def _controller_command(action: F32) -> F64:
     if given.shape != (7,) or not np.isfinite(given).all():
         raise ValueError(f"an action is seven finite numbers (position 3, axis-angle 3, gripper 1), not {action!r}")
     scale = np.array([MAX_POSITION_STEP] * 3 + [MAX_ROTATION_STEP] * 3 + [1.0])
-    return np.clip(given / scale, -1.0, 1.0)
+    command: F64 = np.clip(given / scale, -1.0, 1.0)
+    return command
 
 
 def _action_space() -> gymnasium.spaces.Box:
@@ -228,7 +233,9 @@ def _action_space() -> gymnasium.spaces.Box:
 
 
 def _observation_space(height: int, width: int, *, cameras: bool) -> gymnasium.spaces.Dict:
-    spaces: dict[str, gymnasium.spaces.Space[Any]] = {"low_dim": gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float32)}
+    spaces: dict[str, gymnasium.spaces.Space[Any]] = {
+        "low_dim": gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float32)
+    }
     if cameras:
         spaces.update({name: gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8) for name in CAMERAS})
     return gymnasium.spaces.Dict(spaces)

@@ -20,11 +20,11 @@ TRAVEL_HEIGHT = TABLE_HEIGHT + 0.068  # of the grip site: a carried disc clears 
 RELEASE_CLEARANCE = 0.004
 ATTEMPTS = 4
 WAYPOINT_STEPS = 30  # give up on a waypoint that is not reached by then
-POSITION_GAIN = 1.3  # commands are held for 0.1 s and the arm keeps its momentum: lead it by its velocity or it overshoots
-LOOK_AHEAD_S = 0.06
+POSITION_GAIN = 1.3
+LOOK_AHEAD_S = 0.06  # a command is held for 0.1 s and the arm has momentum: aim short by the way it will drift
 ROTATION_GAIN = 0.7
 CLOSE_STEPS = 4
-OPEN_STEPS = 5  # the fingers ramp for ten control steps, and only then clear the largest disc
+OPEN_STEPS = 5  # the fingers' targets ramp for ten control steps; only at the end do they clear the largest disc
 
 
 def hanoi_moves(n_discs: int, source: int, target: int) -> list[tuple[int, int, int]]:
@@ -117,7 +117,7 @@ class HanoiExpert:
 
 
 def _raised(position: F64, by: float) -> F64:
-    return np.asarray(position + [0.0, 0.0, by])
+    return np.array([position[0], position[1], position[2] + by])
 
 
 def _at_travel_height(position: F64) -> F64:

@@ -6,23 +6,17 @@ about the middle peg: pi/2 lies across the arm's reach, from the robot's right t
 
 from __future__ import annotations
 
-import os
-import sys
 from typing import Any
 
-import numpy as np
-
-from vilp_data.types import F64
-
-if sys.platform.startswith("linux"):
-    os.environ.setdefault("MUJOCO_GL", "osmesa")  # read once, when robosuite is imported: drawing needs no display, no GPU
-
 import mujoco
+import numpy as np
 from robosuite.controllers import load_composite_controller_config
 from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
 from robosuite.models.arenas import TableArena
 from robosuite.models.objects import CylinderObject, HollowCylinderObject
 from robosuite.models.tasks import ManipulationTask
+
+from vilp_data.types import F64
 
 CONTROL_RATE_HZ = 20
 TABLE_HEIGHT = 0.8
@@ -157,8 +151,10 @@ class HanoiScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no typ
             self.sim.data.set_joint_qpos(disc.joints[0], np.array([x, y, z, *facing]))
         context = self.sim._render_context_offscreen
         if context is not None:
-            context.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0  # two to three times faster, and no change worth seeing
             context.vopt.sitegroup[:] = 0
+            context.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = (
+                0  # two to three times faster, no change worth seeing
+            )
 
 
 def _controller(robot: str) -> dict[str, Any]:

@@ -60,32 +60,37 @@ def record_task(
     episodes: int,
     first_seed: int,
     workers: int = 0,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[RecordedEpisode]:
     """Record one episode for each of `episodes` seeds from `first_seed` on, into `out_dir/<task>-seed0000007.mcap`.
 
     A finished log of the same seed and options is kept; anything unfinished is made again. Failures of the expert are written too,
     with success "false" in their metadata. `spec.sim.options` go to the environment. `workers` 0 means one process
-    for each core. `progress` is called with the number of episodes newly done; the list returned is in order of seed.
+    for each core. `progress` hears (done, total) after each; the list returned is in order of seed.
 
     Raises UsageError where the task has no scripted expert, the simulator is not installed, or a log in `out_dir` was made with
     other options.
     """
     if spec.sim is None or spec.sim.env not in RECORDABLE:
         env = "no [sim] table" if spec.sim is None else spec.sim.env
-        raise UsageError("there is no scripted expert for this task", where=spec.name, found=env, remedy=nearest(env, RECORDABLE))
+        raise UsageError(
+            "there is no scripted expert for this task", where=spec.name, found=env, remedy=nearest(env, RECORDABLE)
+        )
     options = spec.sim.options
-    jobs = [_Job(spec.name, options, _log_path(out_dir, spec.name, seed), seed) for seed in range(first_seed, first_seed + episodes)]
+    jobs = [
+        _Job(spec.name, options, _log_path(out_dir, spec.name, seed), seed)
+        for seed in range(first_seed, first_seed + episodes)
+    ]
     done = {job.seed: kept for job in jobs if (kept := _finished(job)) is not None}
     todo = [job for job in jobs if job.seed not in done]
     if progress is not None:
-        progress(len(done))
+        progress(len(done), len(jobs))
     if todo:
         require_simulator(cameras=bool(options.get("cameras", True)))
     for job, episode in map_unordered(_record_one, todo, workers=workers or cpu_count()):
         done[job.seed] = episode
         if progress is not None:
-            progress(1)
+            progress(len(done), len(jobs))
     return [done[job.seed] for job in jobs]
 
 
@@ -93,11 +98,15 @@ def require_simulator(*, cameras: bool) -> None:
     """UsageError with the one command that helps, where robosuite or the software renderer is missing."""
     missing = [name for name in ("gymnasium", "mujoco", "robosuite") if importlib.util.find_spec(name) is None]
     if missing:
-        raise UsageError("the simulator is not installed", found=f"no package called {', '.join(missing)}", remedy="make setup")
-    renderer = os.environ.get("MUJOCO_GL", "osmesa")
-    if cameras and sys.platform.startswith("linux") and renderer == "osmesa" and ctypes.util.find_library("OSMesa") is None:
         raise UsageError(
-            "the cameras cannot be drawn", found="no libOSMesa (MUJOCO_GL=osmesa)", remedy="sudo apt-get install -y libosmesa6"
+            "the simulator is not installed", found=f"no package called {', '.join(missing)}", remedy="make setup"
+        )
+    draws_in_software = sys.platform.startswith("linux") and os.environ.get("MUJOCO_GL", "osmesa") == "osmesa"
+    if cameras and draws_in_software and ctypes.util.find_library("OSMesa") is None:
+        raise UsageError(
+            "the cameras cannot be drawn",
+            found="no libOSMesa (MUJOCO_GL=osmesa)",
+            remedy="sudo apt-get install -y libosmesa6",
         )
 
 
@@ -164,7 +173,9 @@ def _tags(job: _Job, env: HanoiEnv) -> dict[str, str]:
     }
 
 
-def _write_tick(log: EpisodeRecorder, env: HanoiEnv, tick: int, observation: Mapping[str, Any], info: Mapping[str, Any], action: F32) -> None:
+def _write_tick(
+    log: EpisodeRecorder, env: HanoiEnv, tick: int, observation: Mapping[str, Any], info: Mapping[str, Any], action: F32
+) -> None:
     stamp_ns = START_NS + tick * TICK_NS
     for sample in info["proprioception"]:
         _write_proprioception(log, env, START_NS + round(sample.time_s * 1e9), sample)

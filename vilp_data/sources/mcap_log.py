@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from mcap.records import ChunkIndex
 
@@ -17,11 +17,18 @@ from vilp_data.sources.message_decoders import MALFORMED, Decoder, decoder_for
 from vilp_data.types import I64, LogEpisode, Message, TopicInfo
 
 END_OF_TIME_NS = 1 << 64  # past every MCAP time stamp
+WHOLE_FILE = "whole"  # the one demonstration's name: a renamed log must still be known as the same
 EPISODE_RECORD = "episode"  # the metadata record whose entries become an episode's tags
 INDEXED_CHUNKS = 5000  # message indexes read by message_times: about 0.3 s
 
 
-WHOLE_FILE = "whole"  # the one demonstration's name: a renamed log must still be known as the same
+class _OpenChannel(NamedTuple):
+    """A channel whose messages can be read."""
+
+    topic: str
+    schema: str
+    encoding: str
+    decode: Decoder
 
 
 class McapLog:
@@ -32,6 +39,7 @@ class McapLog:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = McapFile(path)
+        self._channels: dict[int, _OpenChannel] = {}
         self._decoders: dict[tuple[str, int], Decoder] = {}  # by message encoding and schema id
         self._glanced: tuple[int, list[RawMessage]] | None = None  # place and messages of the chunk last glanced at
 
@@ -70,7 +78,7 @@ class McapLog:
         start = 0 if start_ns is None else start_ns
         end = END_OF_TIME_NS if end_ns is None else end_ns
         for channel_id in channel_ids:
-            self._decoder(channel_id)  # an unreadable topic is refused before the first message of any
+            self._opened(channel_id)  # an unreadable topic is refused before the first message of any
         return (self._decoded(raw) for raw in self._file.messages(channel_ids, start, end))
 
     def message_times(self) -> tuple[dict[str, I64], bool]:
@@ -117,26 +125,30 @@ class McapLog:
             self._glanced = chunk.chunk_start_offset, found
         return self._glanced[1]
 
-    def _decoder(self, channel_id: int) -> Decoder:
-        channel = self._file.index.channels[channel_id]
-        key = channel.message_encoding, channel.schema_id
-        if key not in self._decoders:
+    def _opened(self, channel_id: int) -> _OpenChannel:
+        """The channel with its decoder; LogError where its messages cannot be read."""
+        if channel_id not in self._channels:
+            channel = self._file.index.channels[channel_id]
             schema = self._file.index.schemas.get(channel.schema_id)
-            where = f"{self.path}, topic {channel.topic}"
-            self._decoders[key] = decoder_for(channel.message_encoding, schema, where=where)
-        return self._decoders[key]
+            key = channel.message_encoding, channel.schema_id
+            if key not in self._decoders:
+                where = f"{self.path}, topic {channel.topic}"
+                self._decoders[key] = decoder_for(channel.message_encoding, schema, where=where)
+            name = schema.name if schema else ""
+            self._channels[channel_id] = _OpenChannel(
+                channel.topic, name, channel.message_encoding, self._decoders[key]
+            )
+        return self._channels[channel_id]
 
     def _decoded(self, raw: RawMessage) -> Message:
-        index = self._file.index
-        channel = index.channels[raw.channel_id]
-        schema = index.schemas.get(channel.schema_id)
+        channel = self._opened(raw.channel_id)
         try:
-            body = self._decoder(raw.channel_id)(raw.data)
+            body = channel.decode(raw.data)
         except MALFORMED as error:
             raise LogError(
                 f"a message of {channel.topic} at {raw.log_time_ns} ns does not fit its schema",
                 where=self.path,
-                found=f"{channel.message_encoding} {schema.name if schema else '(no schema)'}, {len(raw.data)} bytes: {error}",
+                found=f"{channel.encoding} {channel.schema or '(no schema)'}, {len(raw.data)} bytes: {error}",
                 remedy="leave the topic out of the task, or record it with a matching schema",
             ) from error
-        return Message(channel.topic, schema.name if schema else "", raw.log_time_ns, raw.publish_time_ns, body)
+        return Message(channel.topic, channel.schema, raw.log_time_ns, raw.publish_time_ns, body)

@@ -1,0 +1,366 @@
+"""Logs and episodes drawn with Rerun: what goes in comes out, in every way of looking at it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+from rerun.chunk import Chunk, RrdReader
+
+from tests.synthetic import JOINTS, card_frame, joints_at, psnr, task_spec, write_mcap, write_zarr, zarr_task_spec
+from vilp_data import shards, viewer, viewer_process
+from vilp_data.episodes import EpisodeStore, Origin
+from vilp_data.errors import LogError, UsageError
+from vilp_data.keys import FORMAT_VERSION
+from vilp_data.latents import latents_path
+from vilp_data.plots import panel_rank
+from vilp_data.spec import TaskSpec
+from vilp_data.types import F16, U8, Episode
+
+EPISODE = "one"
+SAME_CARD_DB = 30.0  # JPEG at quality 95 stays above; a swapped channel, a flip and the next frame stay below
+
+
+class ShiftEncoder:
+    """A FrameEncoder whose reconstruction is 10 grey levels too bright: its PSNR is 20 log10(255 / 10) = 28.13 dB."""
+
+    key = "shift"
+    key_fields: dict[str, str] = {}  # noqa: RUF012
+    trained_on: frozenset[str] = frozenset()
+
+    def encode(self, frames: U8) -> F16:
+        return frames.transpose(0, 3, 1, 2).astype(np.float16)
+
+    def decode(self, latents: F16) -> U8:
+        return (latents.transpose(0, 2, 3, 1) + 10).astype(np.uint8)
+
+    def latent_shape(self, height: int, width: int) -> tuple[int, int, int]:
+        return 3, height, width
+
+
+def small_store(root: Path, *, n_steps: int = 12) -> tuple[EpisodeStore, ShiftEncoder]:
+    """A dataset of one episode with two views, and latents of both."""
+    views = {name: {"topic": f"/{name}", "height": 48, "width": 64} for name in ("front", "side")}
+    spec = TaskSpec.model_validate(
+        {
+            "name": "small",
+            "views": views,
+            "low_dim": {"pose": {"topic": "/pose", "fields": ["position.x", "position.y"]}},
+            "action": {
+                "move": {"topic": "/act", "fields": ["linear.x", "linear.y"]},
+                "grip": {"topic": "/grip", "fields": ["position[0:1]"]},
+            },
+        }
+    )
+    frames = {
+        view: np.minimum(np.stack([card_frame(i + 3 * v) for i in range(n_steps)]), 245) for v, view in enumerate(views)
+    }
+    ticks = np.arange(n_steps)
+    episode = Episode(
+        id=EPISODE,
+        frames=frames,
+        source_index=dict.fromkeys(views, ticks.astype(np.int32)),
+        log_time_ns=1_700_000_000_000_000_000 + ticks * 100_000_000,
+        low_dim=np.stack([ticks, -ticks], 1).astype(np.float32),
+        action=np.stack([ticks, 2 * ticks, np.sign(ticks - 5)], 1).astype(np.float32),
+        state=None,
+        valid=np.ones(n_steps, np.bool_),
+        age_s={},
+        rate_hz=10.0,
+        tags={},
+        outcome="success",
+    )
+    store, encoder = EpisodeStore(root), ShiftEncoder()
+    store.write_spec(spec)
+    store.write(episode, Origin("log.mcap", "0" * 64, EPISODE, "key", {}))
+    entry = store.entry(EPISODE)
+    for view in views:
+        header = {"format": str(FORMAT_VERSION), "source_frames_sha256": entry.frames_sha256[view]}
+        latents = encoder.encode(frames[view])
+        shards.write_shard(latents_path(root, view, encoder.key, EPISODE), {"latents": latents}, header)
+    return store, encoder
+
+
+def chunks_of(rrd: Path, entity: str) -> list[Chunk]:
+    """Everything but static data at an entity of an .rrd file."""
+    return [chunk for chunk in RrdReader(rrd).stream() if chunk.entity_path == f"/{entity}" and not chunk.is_static]
+
+
+def entities(rrd: Path) -> set[str]:
+    return {chunk.entity_path.lstrip("/") for chunk in RrdReader(rrd).stream()}
+
+
+def column(rrd: Path, entity: str, name: str) -> list[object]:
+    """All values of one component at an entity, in order of time."""
+    rows: list[tuple[object, object]] = []
+    for chunk in chunks_of(rrd, entity):
+        batch = chunk.to_record_batch()
+        if name in batch.schema.names:
+            times = batch.column(viewer.TIMELINE).cast("int64").to_pylist()
+            rows += zip(times, batch.column(name).to_pylist(), strict=True)
+    return [value for _, value in sorted(rows, key=lambda row: row[0])]
+
+
+def encoded_frames(rrd: Path, entity: str) -> list[U8]:
+    """Recorded JPEG or PNG images read back as RGB."""
+    blobs = [np.array(blob[0], np.uint8) for blob in column(rrd, entity, "EncodedImage:blob")]
+    return [cv2.imdecode(blob, cv2.IMREAD_COLOR_RGB) for blob in blobs]
+
+
+def raw_frames(rrd: Path, entity: str, height: int, width: int) -> list[U8]:
+    return [np.array(row[0], np.uint8).reshape(height, width, 3) for row in column(rrd, entity, "Image:buffer")]
+
+
+# --- colour -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("encoding", "codec"), [("cdr", "raw"), ("protobuf", "jpeg"), ("json", "png")])
+def test_the_colour_card_goes_through_rerun_unchanged(tmp_path: Path, encoding: str, codec: str) -> None:
+    log = write_mcap(tmp_path / "a.mcap", encoding=encoding, image_codec=codec)
+    viewer.draw_log(log.path, tmp_path / "a.rrd")
+    entity = "camera/front/image"
+    read = (raw_frames(tmp_path / "a.rrd", entity, 48, 64)) if codec == "raw" else encoded_frames(tmp_path / "a.rrd", entity)
+    assert len(read) == len(log.frames["front"])
+    for shown, recorded in zip(read, log.frames["front"], strict=True):
+        assert psnr(shown, recorded) >= SAME_CARD_DB
+
+
+def mistakes() -> Iterator[tuple[str, Callable[[U8], U8]]]:
+    yield "red and blue swapped", lambda frames: frames[..., ::-1]
+    yield "upside down", lambda frames: frames[:, ::-1]
+    yield "mirrored", lambda frames: frames[:, :, ::-1]
+    yield "one frame late", lambda frames: np.roll(frames, 1, axis=0)
+
+
+@pytest.mark.parametrize(("name", "mistake"), mistakes(), ids=lambda value: value if isinstance(value, str) else "")
+def test_the_colour_test_fails_for(tmp_path: Path, name: str, mistake: Callable[[U8], U8]) -> None:
+    log = write_mcap(tmp_path / "a.mcap", encoding="protobuf")
+    viewer.draw_log(log.path, tmp_path / "a.rrd")
+    wrong = mistake(np.stack(encoded_frames(tmp_path / "a.rrd", "camera/front/image")))
+    assert psnr(wrong[1], log.frames["front"][1]) < SAME_CARD_DB
+
+
+# --- what is drawn ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "protobuf", "json"])
+def test_joints_are_plotted_by_name_from_the_schema_alone(tmp_path: Path, encoding: str) -> None:
+    log = write_mcap(tmp_path / "a.mcap", encoding=encoding)
+    viewer.draw_log(log.path, tmp_path / "a.rrd")
+    rows = column(tmp_path / "a.rrd", "joint_states/position", "Scalars:scalars")
+    assert len(rows) == len(log.joints)
+    np.testing.assert_allclose(rows[10], joints_at((int(log.joint_times_ns[10]) - 1_700_000_000 * 10**9) / 1e9))
+    [names] = [
+        chunk.to_record_batch().column("SeriesLines:names").to_pylist()[0]
+        for chunk in RrdReader(tmp_path / "a.rrd").stream()
+        if chunk.entity_path == "/joint_states/position" and chunk.is_static
+    ]
+    assert names == list(JOINTS)
+
+
+def test_the_topics_that_a_task_calls_actions_come_first() -> None:
+    topics = ["/joint_states", "/odom", "/twist_mux", "/cmd_vel", "/sim/state"]
+    ranked = sorted(topics, key=lambda topic: panel_rank(topic, {"/twist_mux"}))
+    assert ranked == ["/twist_mux", "/cmd_vel", "/joint_states", "/odom", "/sim/state"]
+
+
+def test_a_task_is_no_condition_and_no_hindrance(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap", cameras=("front", "side"))
+    viewer.draw_log(log.path, tmp_path / "with.rrd", spec=task_spec(log))
+    viewer.draw_log(log.path, tmp_path / "without.rrd")
+    assert entities(tmp_path / "with.rrd") == entities(tmp_path / "without.rrd")
+    assert {"camera/front/image", "camera/side/image", "action/position"} <= entities(tmp_path / "with.rrd")
+
+
+def test_the_first_of_many_episodes_is_shown_and_said(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "many.zarr", episode_lengths=(12, 9, 5))
+    drawn = viewer.draw_log(log.path, tmp_path / "a.rrd", spec=zarr_task_spec())
+    assert "3 episodes, showing episode_000" in drawn.notes[0]
+    assert len(raw_frames(tmp_path / "a.rrd", "img", 32, 32)) == 12
+
+
+def test_another_episode_is_shown_by_name(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "many.zarr", episode_lengths=(12, 9, 5))
+    drawn = viewer.draw_log(log.path, tmp_path / "a.rrd", episode="episode_001")
+    assert drawn.notes == ()
+    read = raw_frames(tmp_path / "a.rrd", "img", 32, 32)
+    assert np.array_equal(np.stack(read), log.img[12:21])
+
+
+def test_a_misspelt_episode_is_answered_with_the_nearest(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "many.zarr")
+    with pytest.raises(UsageError, match="did you mean 'episode_001'"):
+        viewer.draw_log(log.path, tmp_path / "a.rrd", episode="episode_01")
+
+
+def test_an_ingested_episode_shows_its_stored_frames_to_the_byte(tmp_path: Path) -> None:
+    store, _ = small_store(tmp_path)
+    viewer.draw_episode(store, EPISODE, tmp_path / "a.rrd")
+    read = raw_frames(tmp_path / "a.rrd", "side/real", 48, 64)
+    assert np.array_equal(np.stack(read), store.read(EPISODE).frames["side"])
+
+
+def test_each_part_of_an_action_is_plotted_under_its_own_name(tmp_path: Path) -> None:
+    store, _ = small_store(tmp_path)
+    viewer.draw_episode(store, EPISODE, tmp_path / "a.rrd")
+    action = store.read(EPISODE).action
+    assert action is not None
+    assert column(tmp_path / "a.rrd", "action/move", "Scalars:scalars") == action[:, :2].tolist()
+    assert column(tmp_path / "a.rrd", "action/grip", "Scalars:scalars") == action[:, 2:].tolist()
+
+
+def test_a_reconstruction_comes_with_its_error_and_its_psnr(tmp_path: Path) -> None:
+    store, encoder = small_store(tmp_path)
+    viewer.draw_episode(store, EPISODE, tmp_path / "a.rrd", encoders={"front": encoder})
+    error = raw_frames(tmp_path / "a.rrd", "front/error", 48, 64)[0]
+    assert (error == 10 * viewer.ERROR_GAIN).all()
+    values = [row[0] for row in column(tmp_path / "a.rrd", "front/psnr", "Scalars:scalars")]
+    np.testing.assert_allclose(values, 20 * np.log10(255 / 10))
+
+
+def test_stale_latents_are_left_out_and_said(tmp_path: Path) -> None:
+    store, encoder = small_store(tmp_path)
+    latents_path(tmp_path, "front", encoder.key, EPISODE).unlink()
+    drawn = viewer.draw_episode(store, EPISODE, tmp_path / "a.rrd", encoders={"front": encoder, "side": encoder})
+    assert "front: no reconstruction" in drawn.notes[0]
+    assert "side/reconstructed" in entities(tmp_path / "a.rrd")
+    assert "front/reconstructed" not in entities(tmp_path / "a.rrd")
+
+
+# --- ways to look at it -----------------------------------------------------------------------------------------------
+
+
+def test_without_a_display_the_other_ways_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(UsageError, match=r"--web.*--save.*--screenshot"):
+        viewer.present(lambda rrd: pytest.fail("drawn for nothing"))
+
+
+def test_a_drawing_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    saved = tmp_path / "out" / "a.rrd"
+    saved.parent.mkdir()
+    saved.write_bytes(b"the one before")
+    damaged = bytearray(log.path.read_bytes())
+    damaged[len(damaged) // 2] ^= 0xFF
+    log.path.write_bytes(damaged)
+    with pytest.raises(LogError):
+        viewer.draw_log(log.path, saved)
+    assert saved.read_bytes() == b"the one before"
+    assert [path.name for path in saved.parent.iterdir()] == ["a.rrd"]
+
+
+def listening(process: psutil.Process) -> list[str]:
+    """Addresses that a process and its children listen on."""
+    family = [process, *process.children(recursive=True)]
+    sockets = [socket for member in family for socket in member.net_connections("inet")]
+    return [socket.laddr.ip for socket in sockets if socket.status == psutil.CONN_LISTEN]
+
+
+SERVE = """
+import sys
+from pathlib import Path
+from vilp_data import viewer
+drawn = viewer.Drawn(Path(sys.argv[1]), "", {})
+viewer.serve_web(drawn, on_url=lambda url: print(url, flush=True), web_port=0, data_port=0)
+"""
+
+
+def test_the_web_page_is_served_to_this_machine_alone_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    viewer.draw_log(log.path, tmp_path / "a.rrd")
+    server = subprocess.Popen([sys.executable, "-c", SERVE, str(tmp_path / "a.rrd")], stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        family = psutil.Process(server.pid).children(recursive=True)
+        assert url.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(url, timeout=10) as page:
+            assert b"<html" in page.read()
+        addresses = listening(psutil.Process(server.pid))
+        assert len(addresses) >= 2
+        assert set(addresses) == {"127.0.0.1"}
+        server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=20) == 0
+        assert not [process for process in family if process.is_running() and process.status() != psutil.STATUS_ZOMBIE]
+    finally:
+        server.kill()
+        server.wait()
+
+
+def rerun_children() -> list[psutil.Process]:
+    return psutil.Process(os.getpid()).children(recursive=True)
+
+
+def picture_or_skip(draw: viewer.Draw, png: Path) -> U8:
+    try:
+        viewer.present(draw, screenshot=png)
+    except viewer_process.ViewerError as error:
+        if viewer_process.GRAPHICS_PACKAGE in str(error):
+            pytest.skip(f"no graphics driver, not even a software one: {viewer_process.GRAPHICS_PACKAGE}")
+        raise
+    image = cv2.imdecode(np.frombuffer(png.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert image.shape == (900, 1600, 3)
+    return image
+
+
+def test_a_picture_shows_the_colour_card_the_right_way_round(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap", encoding="protobuf", cameras=("front", "side"), height=96, width=160)
+    before = rerun_children()
+    image = picture_or_skip(partial(viewer.draw_log, log.path), tmp_path / "a.png").astype(int)
+    left = image[:540, :800]  # the panel of the first camera
+    corners = {"red": (230, 20, 20), "green": (20, 200, 20), "blue": (20, 20, 230), "yellow": (230, 220, 20)}
+    centres = {}
+    for name, colour in corners.items():
+        rows, columns = np.nonzero((np.abs(left - np.array(colour)) < 30).all(axis=-1))
+        assert len(rows) > 5_000, f"no {name} corner in the picture"
+        centres[name] = (np.median(rows), np.median(columns))
+    assert centres["red"][0] < 200 < 300 < centres["blue"][0]
+    assert centres["red"][1] < 200 < 600 < centres["green"][1]
+    assert centres["yellow"][0] > 300
+    assert centres["yellow"][1] > 600
+    assert rerun_children() == before
+
+
+def test_a_viewer_without_a_graphics_driver_is_answered_with_the_package(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setenv(name, "/nonexistent")
+    monkeypatch.setenv("WGPU_BACKEND", "vulkan")
+    log = write_mcap(tmp_path / "a.mcap")
+    with pytest.raises(viewer_process.ViewerError, match="apt-get install .*mesa-vulkan-drivers"):
+        viewer.present(partial(viewer.draw_log, log.path), screenshot=tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_a_viewer_that_does_not_answer_in_time_is_ended(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    drawn = viewer.draw_log(log.path, tmp_path / "a.rrd")
+    before = rerun_children()
+    with pytest.raises(viewer_process.ViewerError, match="did not"):
+        viewer.take_screenshot(drawn, tmp_path / "a.png", timeout_s=0.01)
+    assert rerun_children() == before
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_a_taken_port_is_not_used() -> None:
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert viewer_process.free_port(port) != port

@@ -1,0 +1,76 @@
+"""What a plot holds and in which order plots come: pure, and free of any plotting library."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vilp_data.spec import ActionSpec, VectorSpec
+from vilp_data.types import F32, F64, U8
+
+COMMAND_WORDS = ("action", "command", "cmd", "target", "desired")
+STATE_WORDS = ("joint", "pose", "gripper", "state")
+
+
+@dataclass
+class Plot:
+    """One time series panel: the values of each series over time, NaN where a message lacked one."""
+
+    title: str
+    entity: str
+    names: list[str] = field(default_factory=list)
+    times_ns: list[int] = field(default_factory=list)
+    rows: list[list[float]] = field(default_factory=list)
+
+    def add(self, time_ns: int, values: Mapping[str, float]) -> None:
+        self.names += [name for name in values if name not in self.names]
+        self.times_ns.append(time_ns)
+        self.rows.append([values.get(name, np.nan) for name in self.names])
+
+    def table(self) -> F64:
+        """float64 [n, series]."""
+        return np.array([row + [np.nan] * (len(self.names) - len(row)) for row in self.rows], np.float64)
+
+
+def panel_rank(topic: str, commands: Collection[str]) -> int:
+    """Order of panels: what the task calls an action, what is named like one, joints and poses, the rest."""
+    name = topic.lower()
+    if topic in commands:
+        return 0
+    if any(word in name for word in COMMAND_WORDS):
+        return 1
+    known = [rank for rank, word in enumerate(STATE_WORDS, start=2) if word in name]
+    # Simulator state is for replaying, and says little in a plot.
+    return known[0] if known and "sim" not in name.split("/") else 2 + len(STATE_WORDS)
+
+
+def frame_psnr(real: U8, rebuilt: U8) -> F64:
+    """Peak signal to noise ratio of each frame in dB, float64 [n], of uint8 [n,H,W,3] against [n,H,W,3]; NaN for equal frames."""
+    squared = (real.astype(np.float32) - rebuilt) ** 2
+    error = squared.mean(axis=(1, 2, 3), dtype=np.float64)
+    return 10 * np.log10(255.0**2 / np.where(error > 0, error, np.nan))
+
+
+def vector_parts(values: F32, parts: Mapping[str, ActionSpec | VectorSpec]) -> dict[str, tuple[list[str], F32]]:
+    """Part -> (a label for each column, its columns [F, n]) of a stored vector [F, sum of n], parts in the spec's order.
+
+    One part called "" where the spec does not tell the widths: a part without fields takes whatever its messages hold."""
+    labels = {name: _part_labels(part) for name, part in parts.items()}
+    if sum(map(len, labels.values())) != values.shape[1]:
+        return {"": ([str(index) for index in range(values.shape[1])], values)} if values.shape[1] else {}
+    ends = np.cumsum([len(columns) for columns in labels.values()])
+    return {name: (columns, values[:, end - len(columns) : end]) for (name, columns), end in zip(labels.items(), ends, strict=True) if columns}
+
+
+def _part_labels(part: ActionSpec | VectorSpec) -> list[str]:
+    """A label for each value of a part, as far as the spec tells: `x`, `y`, or the index within a slice."""
+    labels: list[str] = []
+    for path in part.fields:
+        start, colon, stop = path.rpartition("[")[2].rstrip("]").partition(":")
+        if colon:
+            labels += [str(index) for index in range(int(start), int(stop))]
+        else:
+            labels.append(path.rpartition(".")[2])
+    return list(part.names) if part.names and len(labels) <= 1 else labels
