@@ -6,10 +6,10 @@ PYTHON=${PYTHON:-python3}
 TORCH=${TORCH:-torch==2.13.0}
 SUDO=${SUDO:-}
 
-# python3-venv makes the environment; libosmesa6 renders the simulators without a display; the last three draw screenshots.
+# python3-venv makes the environment; libosmesa6 draws the simulators without a display, mesa-vulkan-drivers the viewer's pictures.
 needed=""
 "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || needed="$needed python3-venv"
-for package in libosmesa6 xvfb mesa-vulkan-drivers libxkbcommon-x11-0; do
+for package in libosmesa6 mesa-vulkan-drivers; do
     dpkg -s "$package" >/dev/null 2>&1 || needed="$needed $package"
 done
 if [ -n "$needed" ]; then

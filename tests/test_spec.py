@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from vilp_data import keys
 from vilp_data.errors import SpecError
 from vilp_data.spec import PRESETS, load_task, parse_task, task_names
 
@@ -53,6 +54,12 @@ def test_a_preset_overrides_table_by_table(tmp_path: Path) -> None:
     assert load_task(str(path)).record.episodes == 20
     tiny = load_task(str(path), preset="tiny").record
     assert (tiny.episodes, tiny.first_seed) == (2, 3)
+
+
+def test_the_order_of_an_action_s_parts_is_part_of_the_ingest_fields() -> None:
+    a, b = "[action.a]\ntopic = '/c'\n", "[action.b]\ntopic = '/d'\n"
+    one, other = (parse_task(GOOD + parts, where="x").ingest_fields() for parts in (a + b, b + a))
+    assert keys.digest(one) != keys.digest(other)
 
 
 def test_what_does_not_touch_the_stored_bytes_is_not_part_of_the_ingest_fields() -> None:

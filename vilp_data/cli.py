@@ -15,7 +15,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vilp_data.engine import cpu_count
+from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError, VilpDataError
+from vilp_data.latents import FrameEncoder, load_encoder
 from vilp_data.locate import default_root, find_dataset, remember
 from vilp_data.spec import PRESETS, TaskSpec, load_task
 
@@ -171,8 +173,6 @@ def ingest(
 
 
 def _dataset_and_its_spec(given: Path | None) -> tuple[Path, TaskSpec]:
-    from vilp_data.episodes import EpisodeStore
-
     try:
         root = find_dataset(given)
     except UsageError as error:
@@ -298,12 +298,64 @@ def why_stale(
     raise typer.Exit(1 if reasons else 0)
 
 
+# --- view ----------------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def view(
+    target: Annotated[str, typer.Argument(help="A log, or the id of an ingested episode.", show_default=False)],
+    data: Annotated[
+        Path | None,
+        typer.Option(help="The dataset of an ingested episode. Default: as for the other verbs.", show_default=False),
+    ] = None,
+    episode: Annotated[
+        str | None,
+        typer.Option(help="Which demonstration of a log that holds many. Default: the first.", show_default=False),
+    ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(help="The frame encoder to reconstruct with. Default: the only run there is.", show_default=False),
+    ] = None,
+    encoder: Annotated[
+        str, typer.Option(help="Kind of frame encoder, as registered under vilp.frame_encoders.")
+    ] = "vqgan",
+    web: Annotated[bool, typer.Option("--web", help="Serve a page on 127.0.0.1 until Ctrl-C.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).", show_default=False)] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).", show_default=False)] = None,
+) -> None:
+    """Show a log, or an ingested episode beside its reconstruction, in Rerun.
+
+    Example: vilp-data view episode.mcap --screenshot v.png
+    """
+    from functools import partial
+
+    from vilp_data.viewer import draw_episode, draw_log, present
+
+    if Path(target).exists():
+        draw = partial(draw_log, Path(target), episode=episode)
+    elif Path(target).suffix or "/" in target:
+        raise UsageError("no such log", where=target, remedy="give a log's path, or the id of an ingested episode")
+    else:
+        root, spec = _open(data)
+        encoders = _encoders_of(root, spec, encoder, run)
+        draw = partial(draw_episode, EpisodeStore(root), target, encoders=encoders)
+    present(draw, web=web, save=save, screenshot=screenshot, say=print)
+
+
+def _encoders_of(root: Path, spec: TaskSpec, name: str, run: Path | None) -> dict[str, FrameEncoder]:
+    """The encoders of the run that is named, else of the only one; none where there is none, or several."""
+    from vilp_data.latent_runs import find_run
+
+    if run is None and len(list((root / "runs").glob(f"{name}*"))) != 1:
+        return {}
+    folder = find_run(root, run, name)
+    return {view: load_encoder(name, folder, view) for view in spec.views}
+
+
 # --- shared by the verbs -------------------------------------------------------------------------------------------------
 
 
 def _open(given: Path | None) -> tuple[Path, TaskSpec]:
-    from vilp_data.episodes import EpisodeStore
-
     root = find_dataset(given)
     if given is None:
         console.print(f"dataset: {root}", highlight=False)

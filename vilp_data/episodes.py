@@ -100,7 +100,9 @@ class EpisodeStore:
 
     def write_spec(self, spec: TaskSpec) -> None:
         table = {"format": FORMAT_VERSION, "spec": spec.model_dump(mode="json", by_alias=True)}
-        data = (json.dumps(table, indent=2) + "\n").encode()  # never sorted: the order of action and low_dim parts is the order of columns
+        data = (
+            json.dumps(table, indent=2) + "\n"
+        ).encode()  # never sorted: the order of action and low_dim parts is the order of columns
         path = self.root / "dataset.json"
         if not path.is_file() or path.read_bytes() != data:
             shards.write_atomic(path, data)

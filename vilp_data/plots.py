@@ -60,8 +60,9 @@ def vector_parts(values: F32, parts: Mapping[str, ActionSpec | VectorSpec]) -> d
     labels = {name: _part_labels(part) for name, part in parts.items()}
     if sum(map(len, labels.values())) != values.shape[1]:
         return {"": ([str(index) for index in range(values.shape[1])], values)} if values.shape[1] else {}
-    ends = np.cumsum([len(columns) for columns in labels.values()])
-    return {name: (columns, values[:, end - len(columns) : end]) for (name, columns), end in zip(labels.items(), ends, strict=True) if columns}
+    starts = np.cumsum([0, *map(len, labels.values())])
+    spans = zip(labels.items(), starts, strict=False)  # one start more than parts: the end
+    return {name: (columns, values[:, start : start + len(columns)]) for (name, columns), start in spans if columns}
 
 
 def _part_labels(part: ActionSpec | VectorSpec) -> list[str]:

@@ -180,8 +180,13 @@ class TaskSpec(Frozen):
         return [spec for spec in specs if spec.topic is not None]
 
     def ingest_fields(self) -> dict[str, Any]:
-        """What decides the bytes of an ingested episode, as plain data: part of every episode's key."""
-        return self.model_dump(mode="json", by_alias=True, include={"rate_hz", "views", "low_dim", "action", "state"})
+        """What decides the bytes of an ingested episode, as plain data: part of every episode's key.
+
+        The parts of vectors are lists, since their order is the order of the columns."""
+        fields = self.model_dump(mode="json", by_alias=True, include={"rate_hz", "views", "low_dim", "action", "state"})
+        for vector in ("low_dim", "action"):
+            fields[vector] = [{"part": name, **table} for name, table in fields[vector].items()]
+        return fields
 
 
 def load_task(name_or_path: str, *, preset: str | None = None) -> TaskSpec:

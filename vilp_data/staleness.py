@@ -63,6 +63,9 @@ def first_difference(old: Any, new: Any, path: str = "") -> str | None:
             if difference is not None:
                 return difference
         return None
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        differences = (first_difference(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(old, new, strict=True)))
+        return next((difference for difference in differences if difference is not None), None)
     return None if old == new else f"{path}: {json.dumps(old)} -> {json.dumps(new)}"
 
 

@@ -203,7 +203,9 @@ def _first_shown(source_index: I32, log_time_ns: I64) -> tuple[I64, I64]:
 def _reconstruct(encoder: FrameEncoder, path: Path, rows: I64) -> U8:
     latents = shards.read_shard(path).arrays["latents"]
     if rows.size and int(rows[-1]) >= len(latents):
-        raise StoreError("fewer latents than frames", where=path, found=f"{len(latents)}", remedy="run `vilp-data latents` again")
+        raise StoreError(
+            "fewer latents than frames", where=path, found=f"{len(latents)}", remedy="run `vilp-data latents` again"
+        )
     batches = [encoder.decode(latents[rows[start : start + BATCH]]) for start in range(0, len(rows), BATCH)]
     return np.concatenate(batches)
 
@@ -218,7 +220,9 @@ def _draw_reconstruction(canvas: Canvas, view: str, real: U8, rebuilt: U8, times
     return plot
 
 
-def _vector_plots(kind: str, values: F32, parts: Mapping[str, ActionSpec | VectorSpec], log_time_ns: I64) -> list[list[Plot]]:
+def _vector_plots(
+    kind: str, values: F32, parts: Mapping[str, ActionSpec | VectorSpec], log_time_ns: I64
+) -> list[list[Plot]]:
     """One panel for each part of a stored vector, so that metres and radians keep their own scales."""
     times = log_time_ns.tolist()
     return [
@@ -402,7 +406,9 @@ def open_window(drawn: Drawn) -> None:
             viewer.check_alive()
 
 
-def serve_web(drawn: Drawn, *, on_url: Say, web_port: int = 9090, data_port: int = 9876, timeout_s: float = TIMEOUT_S) -> None:
+def serve_web(
+    drawn: Drawn, *, on_url: Say, web_port: int = 9090, data_port: int = 9876, timeout_s: float = TIMEOUT_S
+) -> None:
     """Serve the drawing to browsers of this machine until Ctrl-C; `on_url` is told the address once it answers.
 
     The ports are wishes: a taken one is replaced by a free one, since a viewer that is there already would take the data."""

@@ -132,4 +132,6 @@ def require_display() -> None:
     """Raises UsageError, naming the ways that need no display, where there is none."""
     if not has_display():
         remedy = "use --web (look at it in a browser), --save x.rrd (look at it elsewhere) or --screenshot x.png"
-        raise UsageError("no display to open a window on", found="neither DISPLAY nor WAYLAND_DISPLAY is set", remedy=remedy)
+        raise UsageError(
+            "no display to open a window on", found="neither DISPLAY nor WAYLAND_DISPLAY is set", remedy=remedy
+        )

@@ -31,10 +31,11 @@ def _bytes(saved: tuple[Arrays, Arrays]) -> dict[str, bytes]:
 
 
 def test_one_batch_can_be_overfitted() -> None:
-    recipe = tiny_recipe(width=16, groups=8, steps=60, batch_size=1, learning_rate=5e-3, schedule="cosine")
+    shape = {"width": 16, "groups": 8, "codes": 64}
+    recipe = tiny_recipe(**shape, steps=100, batch_size=1, learning_rate=5e-3, restart_every=20)
     training = VqganTraining(recipe, card_frames(1))
-    losses = [training.step(index)["l1"] for index in range(60)]
-    assert losses[-1] < 0.4 * losses[0]
+    losses = [training.step(index)["l1"] for index in range(recipe.steps)]
+    assert losses[-1] < 0.25 * losses[0]
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,22 @@ def test_expert_moves_one_disc_and_lets_go(one_disc: HanoiEnv) -> None:
     assert (np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1]) > 0.9).all()  # none jumps to its negative
 
 
+def test_expert_grasps_again_when_a_disc_is_lost_on_the_way(one_disc: HanoiEnv) -> None:
+    _, info = one_disc.reset(seed=3)
+    knocked_away = False
+    for action in HanoiExpert(one_disc).actions():
+        *_, info = one_disc.step(action)
+        if not knocked_away and one_disc.scene.disc_position(0)[2] > 0.84:
+            pose = np.array([0.07, 0.05, 0.807, 1, 0, 0, 0])  # flat on the table, beside the pegs
+            one_disc.scene.sim.data.set_joint_qpos(one_disc.scene.discs[0].joints[0], pose)
+            one_disc.scene.sim.data.set_joint_qvel(one_disc.scene.discs[0].joints[0], np.zeros(6))
+            knocked_away = True
+        if info["is_success"]:
+            break
+    assert knocked_away
+    assert info["is_success"]
+
+
 def test_recorded_actions_give_the_recorded_states_back_bit_for_bit(
     one_disc: HanoiEnv, demonstration: Demonstration
 ) -> None:
