@@ -32,7 +32,8 @@ def _bytes(saved: tuple[Arrays, Arrays]) -> dict[str, bytes]:
 
 def test_one_batch_can_be_overfitted() -> None:
     shape = {"width": 16, "groups": 8, "codes": 64}
-    recipe = tiny_recipe(**shape, steps=100, batch_size=1, learning_rate=5e-3, restart_every=20)
+    schedule = {"steps": 100, "learning_rate": 5e-3, "schedule": "cosine", "warmup_steps": 10}
+    recipe = tiny_recipe(**shape, **schedule, batch_size=1, restart_every=20)
     training = VqganTraining(recipe, card_frames(1))
     losses = [training.step(index)["l1"] for index in range(recipe.steps)]
     assert losses[-1] < 0.25 * losses[0]
