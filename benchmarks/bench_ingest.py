@@ -41,7 +41,9 @@ def main() -> None:
         shutil.rmtree(folder)
     images = LOGS * FRAMES * len(CAMERAS)
     fast, slow = images / statistics.median(bare), images / statistics.median(ours)
-    print(f"ingest, {LOGS} logs x {FRAMES} x {len(CAMERAS)} JPEGs {RECORDED[1]}x{RECORDED[0]} -> {STORED[1]}x{STORED[0]}, one thread")
+    print(
+        f"ingest, {LOGS} logs x {FRAMES} x {len(CAMERAS)} JPEGs {RECORDED[1]}x{RECORDED[0]} -> {STORED[1]}x{STORED[0]}, one thread"
+    )
     print(f"  bare read + decode + resize  {fast:8.0f} images/s")
     print(f"  vilp-data ingest             {slow:8.0f} images/s   {slow / fast:.0%} of bare (aim: 70 %)")
 

@@ -149,7 +149,7 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> Non
 def test_wrong_images_and_mixed_topics_are_refused(tmp_path: Path) -> None:
     with EpisodeRecorder(tmp_path / "a.mcap", metadata={}) as log:
         with pytest.raises(UsageError, match=r"uint8 \[H,W,3\] RGB"):
-            log.image("/camera", TICK_NS, np.zeros((4, 4, 3), np.float32))  # type: ignore[arg-type]
+            log.image("/camera", TICK_NS, np.zeros((4, 4, 3), np.float32))
         log.vector("/state", TICK_NS, [1.0])
         with pytest.raises(UsageError, match="one kind of message"):
             log.joint_state("/state", TICK_NS, ["a"], [1.0])

@@ -129,7 +129,11 @@ def test_the_colour_card_goes_through_rerun_unchanged(tmp_path: Path, encoding: 
     log = write_mcap(tmp_path / "a.mcap", encoding=encoding, image_codec=codec)
     viewer.draw_log(log.path, tmp_path / "a.rrd")
     entity = "camera/front/image"
-    read = (raw_frames(tmp_path / "a.rrd", entity, 48, 64)) if codec == "raw" else encoded_frames(tmp_path / "a.rrd", entity)
+    read = (
+        (raw_frames(tmp_path / "a.rrd", entity, 48, 64))
+        if codec == "raw"
+        else encoded_frames(tmp_path / "a.rrd", entity)
+    )
     assert len(read) == len(log.frames["front"])
     for shown, recorded in zip(read, log.frames["front"], strict=True):
         assert psnr(shown, recorded) >= SAME_CARD_DB

@@ -30,9 +30,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from vilp_data.errors import UsageError
 from vilp_data.shards import atomic_file
-from vilp_data.types import U8
+from vilp_data.types import EPISODE_RECORD, U8
 
-EPISODE_RECORD = "episode"
 JPEG_QUALITY = 95
 CHUNK_BYTES = 512 * 1024
 _ROS = get_typestore(Stores.ROS2_HUMBLE)

@@ -30,6 +30,10 @@ Outcome = Literal["success", "failure", "unknown"]
 # --- logs -----------------------------------------------------------------------------------------------------------
 
 
+EPISODE_RECORD = "episode"
+"""Name of the metadata record in which a log says what it shows (task, seed, success, …): it becomes the episode's tags."""
+
+
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
     """One topic of a log. `schema` is the name the log uses (`sensor_msgs/msg/Image`, `foxglove.CompressedImage`, `array`);

@@ -171,15 +171,18 @@ def format_fidelity(table: dict[str, Any], folder: Path) -> list[str]:
     """The report's summary for a terminal: a line a view, then the warnings."""
     lines = []
     for view, row in table["views"].items():
+        moving = {name: _db(row[name]["moving_psnr"]) for name in ("vqgan", "mean_frame", "copy")}
+        baselines = f"mean frame {moving['mean_frame']}, copy {moving['copy']}"
+        codes = f"{row['codes_used']} of {row['codes']} codes used"
         lines.append(
-            f"{view}: PSNR {row['vqgan']['psnr']:.1f} dB, moving pixels {row['vqgan']['moving_psnr']:.1f} dB (mean frame {row['mean_frame']['moving_psnr']:.1f}, "
-            f"copy {row['copy']['moving_psnr']:.1f}); {row['codes_used']} of {row['codes']} codes used"
+            f"{view}: PSNR {_db(row['vqgan']['psnr'])} dB, moving pixels {moving['vqgan']} dB ({baselines}); {codes}"
         )
-    return [
-        *lines,
-        *(f"warning: {warning}" for warning in table["warnings"]),
-        f"{folder}/report.md and worst.png show it in full",
-    ]
+    warnings = [f"warning: {warning}" for warning in table["warnings"]]
+    return [*lines, *warnings, f"{folder}/report.md and worst.png show it in full"]
+
+
+def _db(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
 
 
 def _dataset(data: Path | None, task: str | None, preset: str | None) -> tuple[Path, TaskSpec]:

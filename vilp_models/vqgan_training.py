@@ -65,7 +65,7 @@ class VqganTraining:
     # --- one step
 
     def step(self, index: int) -> dict[str, float]:
-        """Do step `index`; its losses. Raises DivergedError, before any weight changes, where one is not finite."""
+        """Do step `index`; its losses. Raises DivergedError where one is not finite, before it reaches the weights."""
         for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(self.recipe, index)
@@ -126,9 +126,10 @@ class VqganTraining:
         norm = torch.nn.utils.clip_grad_norm_(parameters, self.recipe.clip_norm or math.inf)
         if not (torch.isfinite(loss) and torch.isfinite(norm)):
             raise DivergedError(
-                f"the {name}'s loss is no longer finite", found=f"loss {loss.item():g}, gradient norm {norm.item():g}",
+                f"the {name}'s loss is no longer finite",
+                found=f"loss {loss.item():g}, gradient norm {norm.item():g}",
                 remedy="lower models.vqgan.learning_rate or set clip_norm; the last checkpoint is kept",
-            )  # fmt: skip
+            )
         optimizer.step()
 
     # --- the codebook

@@ -90,7 +90,7 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
         self.height, self.width = height, width
         self.max_steps = max_steps if max_steps is not None else STEPS_PER_MOVE * (2**n_discs - 1)
         self.render_mode = "rgb_array" if cameras else None
-        self.scene = HanoiScene(robot, n_discs, cameras=cameras)
+        self.scene = HanoiScene(robot, n_discs, image_size=(height, width) if cameras else None)
         self.action_space = _action_space()
         self.observation_space = _observation_space(height, width, cameras=cameras)
         self._n_steps = 0

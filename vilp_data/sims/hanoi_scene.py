@@ -7,6 +7,7 @@ about the middle peg: pi/2 lies across the arm's reach, from the robot's right t
 from __future__ import annotations
 
 from typing import Any
+from xml.etree.ElementTree import Element, SubElement
 
 import mujoco
 import numpy as np
@@ -50,8 +51,10 @@ def peg_positions(base_angle: float) -> F64:
 class HanoiScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no types
     """The robosuite world. It is built once; every reset restores the same model, moves the pegs and stacks the discs."""
 
-    def __init__(self, robot: str, n_discs: int, *, cameras: bool) -> None:
+    def __init__(self, robot: str, n_discs: int, *, image_size: tuple[int, int] | None) -> None:
+        """`image_size` is (height, width) of the largest image that will be drawn; None for a world without cameras."""
         self.n_discs = n_discs
+        self.image_size = image_size
         self.start_peg = 0
         self.base_angle = np.pi / 2
         super().__init__(
@@ -60,7 +63,7 @@ class HanoiScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no typ
             controller_configs=_controller(robot),
             use_camera_obs=False,
             has_renderer=False,
-            has_offscreen_renderer=cameras,
+            has_offscreen_renderer=image_size is not None,
             renderer="mujoco",
             render_camera=None,
             control_freq=CONTROL_RATE_HZ,
@@ -132,6 +135,8 @@ class HanoiScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no typ
             for i in range(self.n_discs)
         ]  # fmt: skip
         self.model = ManipulationTask(arena, [base], [*self.pegs, *self.discs])
+        if self.image_size is not None:
+            _set_drawing_size(self.model.root, *self.image_size)
 
     def _setup_references(self) -> None:
         super()._setup_references()
@@ -166,6 +171,11 @@ def _controller(robot: str) -> dict[str, Any]:
     arm["output_max"] = [MAX_POSITION_STEP] * 3 + [MAX_ROTATION_STEP] * 3
     arm["output_min"] = [-limit for limit in arm["output_max"]]
     return config
+
+
+def _set_drawing_size(model: Element, height: int, width: int) -> None:
+    """Draw into a buffer of just this size: the default 640x480 costs a quarter more time for the same pixels."""
+    SubElement(SubElement(model, "visual"), "global", offwidth=str(width), offheight=str(height))
 
 
 def _looking_at(eye: tuple[float, ...], target: tuple[float, ...]) -> F64:

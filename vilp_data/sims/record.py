@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
-from vilp_data.recorder import EPISODE_RECORD, EpisodeRecorder
+from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
-from vilp_data.types import F32
+from vilp_data.types import EPISODE_RECORD, F32
 
 if TYPE_CHECKING:
     from vilp_data.sims.hanoi import HanoiEnv, Proprioception

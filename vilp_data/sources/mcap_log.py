@@ -14,11 +14,10 @@ from mcap.records import ChunkIndex
 from vilp_data.errors import LogError, nearest
 from vilp_data.sources.mcap_file import McapFile, RawMessage
 from vilp_data.sources.message_decoders import MALFORMED, Decoder, decoder_for
-from vilp_data.types import I64, LogEpisode, Message, TopicInfo
+from vilp_data.types import EPISODE_RECORD, I64, LogEpisode, Message, TopicInfo
 
 END_OF_TIME_NS = 1 << 64  # past every MCAP time stamp
 WHOLE_FILE = "whole"  # the one demonstration's name: a renamed log must still be known as the same
-EPISODE_RECORD = "episode"  # the metadata record whose entries become an episode's tags
 INDEXED_CHUNKS = 5000  # message indexes read by message_times: about 0.3 s
 
 
