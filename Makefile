@@ -55,7 +55,7 @@ view: $(READY)
 	@$(BIN)/vilp-data view $$(ls $(DATA)/logs/*.mcap | head -1)
 
 replay: ingest
-	@$(BIN)/vilp-models rollout --data $(DATA) --policy replay
+	@$(BIN)/vilp-models rollout --data $(DATA) --policy replay --episodes 3
 
 # --- the project -----------------------------------------------------------------------------------------------------
 
@@ -72,7 +72,7 @@ test-slow: $(READY)
 	$(BIN)/pytest -m slow
 
 bench: $(READY)
-	@for bench in benchmarks/bench_*.py; do echo "== $$bench"; $(BIN)/python $$bench || exit 1; done
+	@for bench in benchmarks/bench_*.py; do echo "== $$bench"; PYTHONPATH=. $(BIN)/python $$bench || exit 1; done
 
 docs: $(READY)
 	$(BIN)/python docs/make_cli_reference.py

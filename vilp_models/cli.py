@@ -139,7 +139,7 @@ def rollout(
         raise UsageError(f"no policy called {policy!r}", remedy=nearest(policy, ["replay"]))
     root, spec = _dataset(data, None, None)
     store = EpisodeStore(root)
-    env = make_env(spec)
+    env = make_env(spec, cameras=render)
     tolerance = env.metadata["replay_tolerance"]
     reports, failed = [], 0
     for entry in store.index()[:episodes]:

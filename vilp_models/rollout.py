@@ -81,15 +81,15 @@ class RenderReport:
         return all(min(self.psnr_db[view]) >= minimum_db > min(self.next_step_db[view]) for view in self.psnr_db)
 
 
-def make_env(spec: TaskSpec) -> Any:
-    """The task's simulator. Raises UsageError where the task names none, or its packages are not installed."""
+def make_env(spec: TaskSpec, *, cameras: bool = True) -> Any:
+    """The task's simulator, with or without images in its observations. Raises UsageError where the task names none, or its packages are not installed."""
     if spec.sim is None:
         raise UsageError("this task has no simulator", where=spec.name, remedy="give its TOML a [sim] table with `env`")
     register()
     import gymnasium
 
     try:
-        return gymnasium.make(spec.sim.env, **spec.sim.options)
+        return gymnasium.make(spec.sim.env, **{**spec.sim.options, "cameras": cameras})
     except ImportError as error:
         raise UsageError(f"{spec.sim.env} is not installed", found=str(error), remedy="make setup") from error
     except gymnasium.error.UnregisteredEnv as error:

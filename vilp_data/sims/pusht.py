@@ -30,7 +30,7 @@ Observation = dict[str, U8 | F32]
 class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional extra that the type check leaves out
     """Push the T onto its goal with a disc that chases a target position.
 
-    Observation  "top": uint8 [96,96,3] RGB, top row first; "low_dim": float32 [2], the agent's position, px of 512
+    Observation  "top" (with cameras): uint8 [96,96,3] RGB, top row first; "low_dim": float32 [2], the agent's position, px of 512
     Action       float32 [2], where the agent is to go, px of 512; in force for 0.1 s (ten steps of a PD controller)
     Reward       covered share of the goal / 0.95, at most 1; an episode ends above 0.95
     Info         "state": float64 [5], px of 512 and radians in [0, 2 pi), in the order of `state_names`;
@@ -51,15 +51,14 @@ class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional
         "replay_tolerance": 1e-3,
     }
 
-    def __init__(self, render_mode: str | None = None) -> None:
+    def __init__(self, render_mode: str | None = None, *, cameras: bool = True) -> None:
         self.render_mode = render_mode
+        self.cameras = cameras
         self.action_space = Box(0.0, BOARD_SIZE, (2,), np.float32)
-        self.observation_space = Dict(
-            {
-                "top": Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8),
-                "low_dim": Box(-np.inf, np.inf, (2,), np.float32),  # the walls stop the block, not the agent
-            }
-        )
+        spaces = {"low_dim": Box(-np.inf, np.inf, (2,), np.float32)}  # the walls stop the block, not the agent
+        if cameras:
+            spaces["top"] = Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self.observation_space = Dict(spaces)
         self._sim = GymPushT(obs_type="state", observation_width=FRAME_SIZE, observation_height=FRAME_SIZE)
 
     def reset(
@@ -111,7 +110,8 @@ class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional
             self._sim.space.reindex_shapes_for_body(body)
 
     def _observe(self) -> Observation:
-        return {"top": self._sim._render(), "low_dim": np.array(self._sim.agent.position, np.float32)}
+        low_dim = np.array(self._sim.agent.position, np.float32)
+        return {"low_dim": low_dim} | ({"top": self._sim._render()} if self.cameras else {})
 
     def _info(self, coverage: float, *, is_success: bool) -> dict[str, Any]:
         return {"state": self._sim.get_obs(), "coverage": float(coverage), "is_success": bool(is_success)}
