@@ -21,6 +21,9 @@ TOLERANCE_NS = 1_000
 BACKWARD_JUMP_NS = 1_000_000_000
 """A clock that goes back by more than this was reset, not jittered."""
 
+LONGEST_GAP_NS = 60_000_000_000
+"""A minute without an image, where images come a hundred times as often, is no pause within a demonstration."""
+
 Index = npt.NDArray[np.int64]
 
 
@@ -57,7 +60,18 @@ def median_rate_hz(stamps_ns: I64) -> float:
 
 
 def control_ticks(view_stamps_ns: Mapping[str, I64], rate_hz: float) -> I64:
-    """Ticks at `rate_hz` from the first instant at which every view has an image to the last image of the view that ends first."""
+    """Ticks at `rate_hz` from the first instant at which every view has an image to the last image of the view that ends first.
+
+    Raises AlignError where views do not overlap, or one is silent for so long that its clock must have been set ahead."""
+    for view, stamps in view_stamps_ns.items():
+        gaps = np.diff(stamps)
+        if len(gaps) and gaps.max() > max(LONGEST_GAP_NS, 100 * float(np.median(gaps))):
+            raise AlignError(
+                "the clock jumps ahead, or the camera was off",
+                where=f"view {view}",
+                found=f"{gaps.max() / 1e9:.1f} s without an image, after image {int(gaps.argmax())}",
+                remedy='read this topic by its arrival (clock = "log"), or cut the log there',
+            )
     start = max(int(stamps[0]) for stamps in view_stamps_ns.values())
     end = min(int(stamps[-1]) for stamps in view_stamps_ns.values())
     if end < start:

@@ -147,9 +147,12 @@ class TaskSpec(Frozen):
                 raise ValueError(
                     f"action.{part}: from = {spec.from_!r} is no low_dim part; {nearest(spec.from_, self.low_dim)}"
                 )
-        for view in self.views:
+        topics = [view.topic for view in self.views.values()]
+        if twice := {topic for topic in topics if topics.count(topic) > 1}:
+            raise ValueError(f"two views read topic {min(twice)!r}; a topic is one view")
+        for view in [*self.views, self.name]:
             if not view.replace("_", "").replace("-", "").isalnum():
-                raise ValueError(f"view name {view!r} becomes a folder name: letters, digits, - and _ only")
+                raise ValueError(f"{view!r} becomes a folder's name: letters, digits, - and _ only")
         return self
 
     @model_validator(mode="after")
