@@ -29,7 +29,7 @@ help:
 
 setup: $(READY)
 
-$(READY): pyproject.toml bootstrap.sh
+$(READY): pyproject.toml constraints.txt bootstrap.sh
 	PYTHON='$(PYTHON)' TORCH='$(TORCH)' SUDO='$(SUDO)' sh bootstrap.sh
 	@touch $@
 
@@ -39,7 +39,7 @@ record: $(READY)
 	@$(if $(LOGS),echo "record: using LOGS=$(LOGS)",$(BIN)/vilp-data record --task $(TASK) --preset $(PRESET) --out $(DATA)/logs)
 
 ingest: record
-	@$(BIN)/vilp-data ingest $(LOGS_IN) --task $(TASK) --preset $(PRESET) --into $(DATA)
+	@$(BIN)/vilp-data ingest $(LOGS_IN) --task $(TASK) --preset $(PRESET) --into $(DATA) || [ $$? -eq 1 ]  # 1: some logs could not be read; it says which
 
 split: ingest
 	@$(BIN)/vilp-data split $(DATA)

