@@ -32,7 +32,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     encoder = VqganEncoder(
-        build_vqgan(vqgan_recipe(load_task("hanoi", preset="cpu").models, where="hanoi")), device="cpu"
+        build_vqgan(vqgan_recipe(load_task("hanoi", preset="cpu").models, preset="cpu", where="hanoi")), device="cpu"
     )
     latents.load_encoder = lambda name, run_dir, view: encoder  # type: ignore[assignment]
     folder = Path(tempfile.mkdtemp(prefix="vilp-bench-"))

@@ -20,6 +20,10 @@ class BlockMeans:
         self.trained_on = trained_on
 
     @property
+    def parallel(self) -> bool:
+        return True
+
+    @property
     def key(self) -> str:
         return f"gain{self.gain:g}"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+import time
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,25 @@ def run_until_killed(code: str, arguments: list[str], *, nth: int) -> bool:
     return ended.returncode == -9
 
 
+def run_until_files(code: str, arguments: list[str], *, folder: Path, count: int) -> bool:
+    """Run Python code in a process that is killed once `count` files lie below `folder`; False where it ended before that.
+
+    For work that several processes share: none of them knows how far the others are."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    while process.poll() is None and len(list(folder.rglob("*.safetensors"))) < count:
+        time.sleep(0.001)
+    process.kill()
+    error = process.communicate()[1]
+    assert process.returncode in (0, -9), error
+    return process.returncode == -9
+
+
 def tree(root: Path) -> dict[str, bytes]:
-    """Every file below a folder with its bytes; the lock, which holds nothing, left out."""
+    """Every file below a folder with its bytes; hidden ones left out: the lock, and what is remembered of logs elsewhere."""
     return {
         str(path.relative_to(root)): path.read_bytes()
         for path in sorted(root.rglob("*"))
-        if path.is_file() and path.name != ".lock"
+        if path.is_file() and not path.name.startswith(".")
     }

@@ -247,6 +247,46 @@ def test_stale_latents_name_the_command(root: Path) -> None:
         opened(root).read([0])
 
 
+def test_latents_of_another_length_than_the_frames_are_refused(root: Path) -> None:
+    path = latents_path(root, "side", "key-b", "a")
+    shard = shards.read_shard(path)
+    header = {"source_frames_sha256": shard.metadata["source_frames_sha256"]}
+    shards.write_shard(path, {"latents": shard.arrays["latents"][:-1]}, header)
+    with pytest.raises(StoreError, match=r"found: 5 latents of 6 frames(.|\n)*vilp-data latents"):
+        opened(root).read([0])
+
+
+def test_frames_of_another_episode_are_refused_and_name_the_command(root: Path) -> None:
+    store = EpisodeStore(root)
+    store.frames_path("front", "a").write_bytes(store.frames_path("front", "c").read_bytes())
+    with pytest.raises(StoreError, match=r"front/a.safetensors: not the frames(.|\n)*vilp-data ingest"):
+        opened(root).read([0])
+    assert opened(root, with_frames=False).read([0]).frames == {}
+
+
+def test_an_episode_ingested_anew_after_opening_is_not_read_as_the_old_one(root: Path) -> None:
+    dataset = opened(root)
+    add_episodes(root, replace(EPISODES[0], low_dim=EPISODES[0].low_dim + 1))
+    with pytest.raises(StoreError, match=r"not the episode that the index knows(.|\n)*open the dataset again"):
+        dataset.read([0])
+
+
+@pytest.mark.parametrize(
+    ("source_index", "says"),
+    [
+        (np.zeros(11, np.int32), "11 of source_index/front, 12 steps"),
+        (np.full(12, 12, np.int32), "frames 12 to 12 of 12"),
+    ],
+)
+def test_steps_that_do_not_fit_their_frames_are_refused(root: Path, source_index: np.ndarray, says: str) -> None:
+    path = EpisodeStore(root).steps_path("a")
+    shard = shards.read_shard(path)
+    header = {name: value for name, value in shard.metadata.items() if name != "sha256"}
+    shards.write_shard(path, {**shard.arrays, "source_index/front": source_index}, header)
+    with pytest.raises(StoreError, match=rf"{says}(.|\n)*vilp-data ingest"):
+        opened(root).read([0])
+
+
 def test_an_unknown_key_or_view_is_refused(root: Path) -> None:
     with pytest.raises(StoreError, match="vilp-data latents"):
         opened(root, latent_keys={"front": "no-such-key"})

@@ -136,12 +136,6 @@ def test_raw_images_whose_bytes_do_not_fit_are_refused(n_bytes: int, step: int) 
         decode_image(raw(bytes(n_bytes), "rgb8", 8, 8, step))
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "yuv422", "bayer_rggb8", "8UC3", ""])
-def test_other_raw_encodings_are_refused_with_the_list(encoding: str) -> None:
-    with pytest.raises(DecodeError, match="rgb8, bgr8, rgba8, bgra8, mono8"):
-        decode_image(raw(bytes(192), encoding, 8, 8, 24))
-
-
 @pytest.mark.parametrize("codec", ["jpeg", "png"])
 def test_a_cut_off_compressed_image_is_refused_at_every_length(codec: Any) -> None:
     data = encode_image(colour_card(), codec)

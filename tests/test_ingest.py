@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zarr
 
 from tests import synthetic
-from tests.faults import kill_moments, run_until_killed, tree
+from tests.faults import kill_moments, run_until_files, run_until_killed, tree
 from tests.synthetic import task_spec, write_mcap, write_zarr, zarr_task_spec
 from vilp_data import shards
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, StoreError, UsageError
 from vilp_data.ingest import IngestReport, ingest_logs
-from vilp_data.spec import TaskSpec
+from vilp_data.sources.mcap_log import McapLog
+from vilp_data.spec import TaskSpec, load_task
 from vilp_data.staleness import stale_episodes
 from vilp_data.types import Episode
 
@@ -188,7 +192,7 @@ def test_commands_that_are_no_numbers_mask_their_steps_and_are_counted(
     assert np.flatnonzero(~episode.valid).tolist() == [5, 6, 7]
     assert episode.action is not None
     assert np.isfinite(episode.action).all()
-    assert "action: missing, stale or not finite at 3 of 20 steps, first at step 5" in report.findings["run"][0]
+    assert "action target: missing, stale or not finite at 3 of 20 steps, first at step 5" in report.findings["run"][0]
 
 
 def test_a_sensor_that_stops_masks_what_it_can_no_longer_tell(tmp_path: Path) -> None:
@@ -240,6 +244,232 @@ def test_ingest_while_another_process_writes_is_refused(tmp_path: Path) -> None:
         ingest([log.path], tmp_path / "data", task_spec(log))
 
 
+# --- one dataset, one spec, one time scale -----------------------------------------------------------------------------------
+
+
+def write_two_runs(folder: Path) -> tuple[Path, Path, TaskSpec]:
+    one = write_mcap(folder / "a.mcap", jitter_s=0.001, seed=1)
+    two = write_mcap(folder / "b.mcap", jitter_s=0.001, seed=2)
+    return one.path, two.path, task_spec(one)
+
+
+def with_elbow_first(spec: TaskSpec) -> TaskSpec:
+    table = spec.model_dump(by_alias=True)
+    table["low_dim"]["joints"]["names"] = ("elbow", "shoulder", "wrist")
+    return TaskSpec.model_validate(table)
+
+
+def test_episodes_of_another_spec_do_not_stay_beside_new_ones(tmp_path: Path) -> None:
+    a, b, spec = write_two_runs(tmp_path)
+    ingest([a], tmp_path / "data", spec)
+    before = tree(tmp_path / "data")
+    with pytest.raises(UsageError, match=r'low_dim\[0\].names\[0\]: "shoulder" -> "elbow"'):
+        ingest([b], tmp_path / "data", with_elbow_first(spec))
+    assert tree(tmp_path / "data") == before
+    assert ingest([a, b], tmp_path / "data", with_elbow_first(spec)).written == ["a", "b"]
+
+
+def test_a_dataset_belongs_to_one_task(tmp_path: Path) -> None:
+    a, b, spec = write_two_runs(tmp_path)
+    ingest([a], tmp_path / "data", spec)
+    with pytest.raises(UsageError, match="another task"):
+        ingest([b], tmp_path / "data", spec.model_copy(update={"name": "other"}))
+
+
+def test_a_spec_that_fits_no_log_leaves_the_dataset_as_it_was(tmp_path: Path) -> None:
+    a, _, spec = write_two_runs(tmp_path)
+    table = spec.model_dump(by_alias=True)
+    table["views"]["front"]["topic"] = "/nope"
+    wrong = TaskSpec.model_validate(table)
+    assert ingest([a], tmp_path / "new", wrong).failed
+    assert tree(tmp_path / "new") == {}
+    ingest([a], tmp_path / "data", spec)
+    before = tree(tmp_path / "data")
+    assert ingest([a], tmp_path / "data", wrong).failed
+    assert tree(tmp_path / "data") == before
+
+
+def test_a_dataset_without_its_spec_gets_it_from_the_next_run(tmp_path: Path) -> None:
+    a, _, spec = write_two_runs(tmp_path)
+    ingest([a], tmp_path / "data", spec)
+    before = tree(tmp_path / "data")
+    (tmp_path / "data" / "dataset.json").unlink()
+    assert ingest([a], tmp_path / "data", spec).fresh == ["a"]
+    assert tree(tmp_path / "data") == before
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_logs_of_another_rate_are_refused_where_none_is_stated(tmp_path: Path, workers: int) -> None:
+    slow, fast = tmp_path / "m-slow.mcap", tmp_path / "a-fast.mcap"
+    log = write_mcap(slow, camera_hz=10.0)
+    ingest([slow], tmp_path / "data", task_spec(log, rate_hz=None))
+    write_mcap(fast, camera_hz=20.0)
+    close = write_mcap(tmp_path / "close.mcap", camera_hz=10.05)
+    logs = [fast, close.path, slow]
+    report = ingest_logs(logs, tmp_path / "data", task_spec(log, rate_hz=None), workers=workers)
+    assert report.written == ["close"]
+    ((name, message),) = report.failed
+    assert name == "a-fast"
+    assert "20 Hz" in message
+    assert "state rate_hz" in message
+    # In an empty dataset the first by id sets the rate, whatever the order of logs and workers.
+    report = ingest_logs(logs[::-1], tmp_path / "empty", task_spec(log, rate_hz=None), workers=workers)
+    assert report.written == ["a-fast"]
+    assert [name for name, _ in report.failed] == ["close", "m-slow"]
+
+
+# --- logs that change --------------------------------------------------------------------------------------------------------
+
+
+def write_grown_zarr(path: Path, lengths: list[int], *, edit_row: int | None = None) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    write_zarr(path, episode_lengths=lengths)
+    if edit_row is not None:
+        zarr.open_group(path)["data/action"][edit_row] = 77.0
+
+
+def stored_files(root: Path) -> dict[str, bytes]:
+    return {name: data for name, data in tree(root).items() if name.endswith(".safetensors")}
+
+
+def test_one_more_demonstration_in_a_store_adds_one_episode_and_touches_no_other(tmp_path: Path) -> None:
+    log, root = tmp_path / "replay.zarr", tmp_path / "data"
+    write_grown_zarr(log, [12, 9, 5])
+    ingest([log], root, zarr_task_spec())
+    before = stored_files(root)
+    write_grown_zarr(log, [12, 9, 5, 8])
+    report = ingest([log], root, zarr_task_spec())
+    assert report.written == ["replay-episode_003"]
+    assert report.fresh == [f"replay-episode_00{i}" for i in range(3)]
+    assert (report.replaced, report.notes) == ([], [])
+    assert stored_files(root).items() >= before.items()
+    assert len(EpisodeStore(root).index()) == 4
+
+
+def test_a_changed_demonstration_replaces_its_episode_and_is_named(tmp_path: Path) -> None:
+    log, root = tmp_path / "replay.zarr", tmp_path / "data"
+    write_grown_zarr(log, [12, 9, 5])
+    ingest([log], root, zarr_task_spec())
+    write_grown_zarr(log, [12, 9, 5], edit_row=15)
+    report = ingest([log], root, zarr_task_spec())
+    assert report.written == report.replaced == ["replay-episode_001"]
+    action = EpisodeStore(root).read("replay-episode_001").action
+    assert action is not None
+    assert action[3].tolist() == [77.0, 77.0]
+    write_grown_zarr(tmp_path / "whole" / "replay.zarr", [12, 9, 5], edit_row=15)
+    ingest([tmp_path / "whole" / "replay.zarr"], tmp_path / "fresh", zarr_task_spec())
+    assert tree(root) == tree(tmp_path / "fresh")
+
+
+def test_another_store_of_the_same_name_overwrites_nothing(tmp_path: Path) -> None:
+    write_grown_zarr(tmp_path / "monday" / "replay.zarr", [12, 9, 5])
+    write_grown_zarr(tmp_path / "tuesday" / "replay.zarr", [7, 8])
+    root = tmp_path / "data"
+    ingest([tmp_path / "monday"], root, zarr_task_spec())
+    before = stored_files(root)
+    report = ingest([tmp_path / "tuesday"], root, zarr_task_spec())
+    assert len(report.written) == 2
+    assert not report.replaced
+    assert "both are kept" in report.notes[0]
+    assert stored_files(root).items() >= before.items()
+
+
+def test_two_stores_of_one_name_given_together_keep_their_episodes(tmp_path: Path) -> None:
+    write_grown_zarr(tmp_path / "a" / "replay.zarr", [12, 9, 5])
+    write_grown_zarr(tmp_path / "b" / "replay.zarr", [12, 9, 5], edit_row=15)
+    root = tmp_path / "data"
+    assert len(ingest([tmp_path / "a", tmp_path / "b"], root, zarr_task_spec()).written) == 4
+    again = ingest([tmp_path / "b", tmp_path / "a"], root, zarr_task_spec())
+    assert (again.written, len(again.fresh)) == ([], 4)
+
+
+def test_a_later_log_of_the_same_name_is_kept_beside_the_first_and_said(tmp_path: Path) -> None:
+    for day, seed in (("monday", 1), ("tuesday", 2)):
+        (tmp_path / day).mkdir()
+        log = write_mcap(tmp_path / day / "run.mcap", jitter_s=0.001, seed=seed)
+    root = tmp_path / "data"
+    ingest([tmp_path / "monday"], root, task_spec(log))
+    before = stored_files(root)
+    report = ingest([tmp_path / "tuesday"], root, task_spec(log))
+    (new,) = report.written
+    assert new.startswith("run-")
+    assert new in report.notes[0]
+    assert stored_files(root).items() >= before.items()
+    assert ingest([tmp_path], root, task_spec(log)).fresh == ["run", new]
+
+
+def test_a_log_that_looks_untouched_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = write_mcap(tmp_path / "run.mcap")
+    os.utime(log.path, (1e9, 1e9))
+    ingest([log.path], tmp_path / "data", task_spec(log))
+    monkeypatch.setattr(McapLog, "sha256", lambda self: pytest.fail("read again"))
+    assert ingest([log.path], tmp_path / "data", task_spec(log)).fresh == ["run"]
+    monkeypatch.undo()
+    changed = write_mcap(log.path, jitter_s=0.001, seed=3)
+    os.utime(log.path, (1e9, 1e9))
+    assert ingest([log.path], tmp_path / "data", task_spec(changed)).written != []
+
+
+# --- which files are logs ------------------------------------------------------------------------------------------------------
+
+
+def test_hidden_files_in_folders_are_nobody_s_logs(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "logs.mcap")
+    folder = tmp_path / "logs"
+    (folder / ".Trash").mkdir(parents=True)
+    log.path.rename(folder / "run.mcap")
+    for hidden in ("._run.mcap", ".DS_Store", ".Trash/old.mcap"):
+        (folder / hidden).write_bytes(b"of no interest")
+    report = ingest([folder], tmp_path / "data", task_spec(log))
+    assert (report.written, report.failed) == (["run"], [])
+
+
+def test_an_episode_never_hides_behind_a_dot(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / ".run.mcap")
+    assert ingest([log.path], tmp_path / "data", task_spec(log)).written == ["run"]
+    assert only_episode(tmp_path / "data").id == "run"
+
+
+def test_logs_that_are_passed_over_are_named(tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    log = write_mcap(folder / "run.mcap")
+    for name in ("old.bag", "bag_0.db3", "bag_1.mcap.zstd", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    report = ingest([folder], tmp_path / "data", task_spec(log))
+    assert [Path(path).name for path in report.passed_over] == ["bag_0.db3", "bag_1.mcap.zstd", "old.bag"]
+    (folder / "run.mcap").unlink()
+    with pytest.raises(UsageError, match="old.bag"):
+        ingest([folder], tmp_path / "data", task_spec(log))
+
+
+def test_a_split_bag_is_refused_and_keeps_no_other_log_back(tmp_path: Path) -> None:
+    bag = tmp_path / "logs" / "bag"
+    bag.mkdir(parents=True)
+    log = write_mcap(tmp_path / "logs" / "run.mcap")
+    parts = [write_mcap(bag / f"bag_{i}.mcap", jitter_s=0.001, seed=i + 1).path for i in range(2)]
+    listed = "".join(f"    - {part.name}\n" for part in parts)
+    (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{listed}")
+    report = ingest([tmp_path / "logs"], tmp_path / "data", task_spec(log))
+    assert report.written == ["run"]
+    ((name, message),) = report.failed
+    assert name == "bag"
+    assert "split into several files" in message
+    assert ingest(parts, tmp_path / "data", task_spec(log)).written == ["bag_0", "bag_1"]
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_zarr_stores_of_both_formats_are_found_in_folders(tmp_path: Path, zarr_format: int) -> None:
+    source = zarr.open_group(write_zarr(tmp_path / "source.zarr").path, mode="r")
+    store = zarr.create_group(tmp_path / "logs" / "deep" / "replay.zarr", zarr_format=zarr_format)
+    for group in ("data", "meta"):
+        made = store.create_group(group)
+        for name, array in source[group].arrays():
+            chunks = (7, *array.shape[1:]) if group == "data" else array.shape
+            made.create_array(name, data=array[:], chunks=chunks, config={"write_empty_chunks": True})
+    assert len(ingest([tmp_path / "logs"], tmp_path / "data", zarr_task_spec()).written) == 3
+
+
 # --- the store -----------------------------------------------------------------------------------------------------------
 
 
@@ -264,6 +494,19 @@ def test_frames_of_another_ingest_are_noticed(tmp_path: Path) -> None:
     store.frames_path("top", one.id).write_bytes(store.frames_path("top", two.id).read_bytes())
     with pytest.raises(StoreError, match="not the frames"):
         store.read(one.id)
+
+
+@pytest.mark.parametrize("damage", ["deleted", "cut", "of another episode"])
+def test_frames_that_do_not_fit_are_made_again(tmp_path: Path, damage: str) -> None:
+    log, root = write_zarr(tmp_path / "replay.zarr"), tmp_path / "data"
+    ingest([log.path], root, zarr_task_spec())
+    before, store = tree(root), EpisodeStore(root)
+    one, two = store.index()[:2]
+    path = store.frames_path("top", one.id)
+    whole, other = path.read_bytes(), store.frames_path("top", two.id).read_bytes()
+    path.unlink() if damage == "deleted" else path.write_bytes(whole[:-5] if damage == "cut" else other)
+    assert ingest([log.path], root, zarr_task_spec()).written == [one.id]
+    assert tree(root) == before
 
 
 def test_a_dataset_of_another_format_version_is_refused(tmp_path: Path) -> None:
@@ -294,3 +537,37 @@ def test_ingest_killed_at_any_moment_and_run_again_gives_the_same_bytes(tmp_path
     ingest([log.path], tmp_path / "killed", zarr_task_spec())
     ingest([log.path], tmp_path / "whole", zarr_task_spec())
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
+TWO_WORKERS = """
+import sys
+from pathlib import Path
+from vilp_data.ingest import ingest_logs
+from vilp_data.spec import load_task
+ingest_logs([Path(sys.argv[1])], Path(sys.argv[2]), load_task(sys.argv[3]), workers=2)
+"""
+
+
+@pytest.mark.parametrize(
+    "count", [1, 5, pytest.param(3, marks=pytest.mark.slow), pytest.param(9, marks=pytest.mark.slow)]
+)
+def test_two_workers_killed_and_run_again_give_the_bytes_of_one(tmp_path: Path, count: int) -> None:
+    logs, task = tmp_path / "logs", tmp_path / "task.toml"
+    logs.mkdir()
+    for i in range(6):
+        log = write_mcap(logs / f"run{i}.mcap", jitter_s=0.001, seed=i)
+    task.write_text(
+        'name = "synthetic"\nrate_hz = 10.0\n[low_dim.joints]\ntopic = "/joint_states"\nfields = ["position"]\n'
+        '[views.front]\ntopic = "/camera/front/image"\nheight = 48\nwidth = 64\n'
+    )
+    killed = tmp_path / "killed"
+    assert run_until_files(TWO_WORKERS, [str(logs), str(killed), str(task)], folder=killed, count=count)
+    with shards.writer_lock(killed):  # whoever could still write is gone
+        after = tree(killed)
+    spec = load_task(str(task))
+    report = ingest_logs([logs], killed, spec, workers=2)
+    assert len(report.written) + len(report.fresh) == 6
+    assert report.written
+    assert not {name for name in after if "/steps/" in name and tree(killed)[name] != after[name]}
+    ingest([log.path.parent], tmp_path / "whole", spec)
+    assert tree(killed) == tree(tmp_path / "whole")

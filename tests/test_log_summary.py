@@ -111,6 +111,28 @@ def test_zarr_is_summarised_with_its_rate(tmp_path: Path) -> None:
     assert (summary.n_episodes, summary.log_clock) == (3, "none")
 
 
+def test_the_rate_of_rows_without_time_is_said_to_be_assumed(tmp_path: Path) -> None:
+    summary = summarise(write_zarr(tmp_path / "z.zarr").path, array_rate_hz=20.0)
+    assert summary.assumed_rate_hz == 20.0
+    assert "20 rows a second are assumed" in format_summary(summary)
+    assert summarise(write_mcap(tmp_path / "run.mcap").path).assumed_rate_hz is None
+
+
+def test_a_topic_of_two_channels_has_its_whole_rate(tmp_path: Path) -> None:
+    path = tmp_path / "merged.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "test")
+        channels = [writer.register_channel("/t", "json", 0) for _ in range(2)]
+        for index in range(40):
+            time = START_NS + index * 50_000_000
+            writer.add_message(channels[index % 2], time, b"{}", time)
+        writer.finish()
+    found = topic(summarise(path), "/t")
+    assert found.rate_hz == pytest.approx(20)
+    assert (found.n_messages, found.backward_jumps) == (40, 0)
+
+
 def test_the_summary_is_plain_data_and_a_readable_table(tmp_path: Path) -> None:
     summary = summarise(write_mcap(tmp_path / "run.mcap", tags={"seed": "3"}).path)
     assert json.loads(json.dumps(summary.as_dict()))["topics"][0]["name"] == "/action"

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 
 from tests.pusht_human import N_EPISODES, human_episode, simulator
 from vilp_data.errors import UsageError
+from vilp_data.spec import parse_task
 from vilp_data.types import Episode
-from vilp_models.rollout import format_replay, replay
+from vilp_models.rollout import format_replay, make_env, replay
 
 TOLERANCE_PX = 1e-3
 
@@ -61,8 +63,8 @@ def test_replay_gives_states_back_with_the_tagged_seed_and_angles_that_wrap(inte
 
 def test_replay_reports_progress_through_both_plays(integrated):
     told = []
-    replay(integrated, Integrator(), progress=told.append)
-    assert sum(told) == 6
+    replay(integrated, Integrator(), progress=lambda done, total: told.append((done, total)))
+    assert told == [(done, 6) for done in range(1, 7)]
 
 
 def test_replay_refuses_what_it_cannot_play(integrated):
@@ -84,6 +86,50 @@ def test_replay_refuses_a_simulator_with_another_state(integrated):
 
     with pytest.raises(UsageError, match="7 values, recorded 3"):
         replay(integrated, Longer())
+
+
+class Plain(gymnasium.Env):
+    """A user's simulator that knows nothing of cameras."""
+
+    def __init__(self, gain: float = 1.0) -> None:
+        self.gain = gain
+        self.observation_space = self.action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+
+class WithCameras(Plain):
+    def __init__(self, gain: float = 1.0, cameras: bool = True) -> None:
+        super().__init__(gain)
+        self.cameras = cameras
+
+
+@pytest.fixture
+def task():
+    """A task of a given simulator, which is registered for the length of a test."""
+
+    def of(entry_point, options=""):
+        gymnasium.registry.pop("test/Own-v0", None)
+        gymnasium.register("test/Own-v0", entry_point=entry_point, disable_env_checker=True)
+        text = (
+            f'name = "own"\n[views.top]\ntopic = "/top"\nheight = 8\nwidth = 8\n[sim]\nenv = "test/Own-v0"\n{options}'
+        )
+        return parse_task(text, where="test")
+
+    yield of
+    gymnasium.registry.pop("test/Own-v0", None)
+
+
+def test_a_users_simulator_is_made_with_its_options_and_told_of_cameras_only_to_leave_them_out(task):
+    assert make_env(task(Plain, "options = { gain = 2.0 }")).unwrapped.gain == 2.0
+    assert make_env(task(WithCameras)).unwrapped.cameras
+    assert not make_env(task(WithCameras), cameras=False).unwrapped.cameras
+
+
+@pytest.mark.parametrize(
+    ("options", "cameras", "says"), [("", False, "cameras"), ("options = { gian = 2.0 }", True, "gian")]
+)
+def test_a_simulator_that_does_not_take_its_options_is_told_the_contract(task, options, cameras, says):
+    with pytest.raises(UsageError, match=rf"own: test/Own-v0 cannot be made(.|\n)*{says}(.|\n)*must take"):
+        make_env(task(Plain, options), cameras=cameras)
 
 
 @pytest.mark.sim

@@ -132,6 +132,18 @@ def test_what_a_killed_writer_left_is_cleared_away(tmp_path: Path) -> None:
         assert not leftover.exists()
 
 
+def test_what_a_killed_recorder_or_trainer_left_goes_once_it_is_old(tmp_path: Path) -> None:
+    """They may be at work beside this lock, so a young file may still be theirs."""
+    old, young = tmp_path / "runs" / "vqgan" / ".a.safetensors.1.tmp", tmp_path / "logs" / ".b.mcap.2.tmp"
+    for leftover in (old, young):
+        leftover.parent.mkdir(parents=True)
+        leftover.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    with shards.writer_lock(tmp_path):
+        assert not old.exists()
+        assert young.exists()
+
+
 def test_thousands_of_shards_open_under_a_low_descriptor_limit(shard: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(256, hard), hard))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import urllib.request
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -15,12 +18,25 @@ import cv2
 import numpy as np
 import psutil
 import pytest
+from mcap.writer import Writer
 from rerun.chunk import Chunk, RrdReader
 
-from tests.synthetic import JOINTS, card_frame, joints_at, psnr, task_spec, write_mcap, write_zarr, zarr_task_spec
-from vilp_data import shards, viewer, viewer_process
+from tests.real_data import real_data
+from tests.synthetic import (
+    JOINTS,
+    START_NS,
+    card_frame,
+    encode_image,
+    joints_at,
+    psnr,
+    task_spec,
+    write_mcap,
+    write_zarr,
+    zarr_task_spec,
+)
+from vilp_data import shards, viewer, viewer_canvas, viewer_process, viewer_window
 from vilp_data.episodes import EpisodeStore, Origin
-from vilp_data.errors import LogError, UsageError
+from vilp_data.errors import LogError, StoreError, UsageError
 from vilp_data.keys import FORMAT_VERSION
 from vilp_data.latents import latents_path
 from vilp_data.plots import panel_rank
@@ -106,7 +122,7 @@ def column(rrd: Path, entity: str, name: str) -> list[object]:
     for chunk in chunks_of(rrd, entity):
         batch = chunk.to_record_batch()
         if name in batch.schema.names:
-            times = batch.column(viewer.TIMELINE).cast("int64").to_pylist()
+            times = batch.column(viewer_canvas.TIMELINE).cast("int64").to_pylist()
             rows += zip(times, batch.column(name).to_pylist(), strict=True)
     return [value for _, value in sorted(rows, key=lambda row: row[0])]
 
@@ -241,6 +257,136 @@ def test_stale_latents_are_left_out_and_said(tmp_path: Path) -> None:
     assert "front/reconstructed" not in entities(tmp_path / "a.rrd")
 
 
+# --- what cannot be read ----------------------------------------------------------------------------------------------
+
+
+def write_json_log(path: Path, messages: list[tuple[str, str, bytes]]) -> Path:
+    """A log of (topic, schema, bytes), a tenth of a second apart."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "test")
+        channels: dict[str, int] = {}
+        for number, (topic, schema, data) in enumerate(messages):
+            if topic not in channels:
+                schema_id = writer.register_schema(schema, "jsonschema", b"{}")
+                encoding = "unheard of" if schema == "Unheard" else "json"
+                channels[topic] = writer.register_channel(topic, encoding, schema_id)
+            writer.add_message(channels[topic], START_NS + number * 10**8, data, 0)
+        writer.finish()
+    return path
+
+
+def json_image(schema: str, **body: object) -> tuple[str, bytes]:
+    return schema, json.dumps(body).encode()
+
+
+PNG = encode_image(card_frame(0), "png")
+GOOD = json_image("foxglove.CompressedImage", format="png", data=base64.b64encode(PNG).decode())
+CUT_OFF = json_image("foxglove.CompressedImage", format="png", data=base64.b64encode(PNG[:-30]).decode())
+DEPTH = json_image(
+    "foxglove.RawImage", encoding="16UC1", height=2, width=2, step=4, data=base64.b64encode(bytes(8)).decode()
+)
+
+
+def test_a_depth_topic_is_left_out_and_said(tmp_path: Path) -> None:
+    log = write_json_log(tmp_path / "a.mcap", [("/depth", *DEPTH), ("/camera", *GOOD)] * 3)
+    drawn = viewer.draw_log(log, tmp_path / "a.rrd")
+    assert len(encoded_frames(tmp_path / "a.rrd", "camera")) == 3
+    [note] = drawn.notes
+    assert note.startswith("/depth: 3 messages left out")
+    assert "16UC1" in note
+
+
+def test_damaged_images_among_good_ones_are_skipped_and_counted(tmp_path: Path) -> None:
+    log = write_json_log(tmp_path / "a.mcap", [("/camera", *image) for image in (CUT_OFF, GOOD, CUT_OFF, GOOD, GOOD)])
+    drawn = viewer.draw_log(log, tmp_path / "a.rrd")
+    assert len(encoded_frames(tmp_path / "a.rrd", "camera")) == 3
+    assert [note.partition(";")[0] for note in drawn.notes] == ["/camera: 2 messages left out"]
+
+
+def test_a_message_that_does_not_fit_its_schema_is_skipped_and_counted(tmp_path: Path) -> None:
+    number = ("/n", "Number", b'{"x": 1}')
+    log = write_json_log(tmp_path / "a.mcap", [number, ("/n", "Number", b"{no json"), number])
+    drawn = viewer.draw_log(log, tmp_path / "a.rrd")
+    assert column(tmp_path / "a.rrd", "n", "Scalars:scalars") == [[1.0], [1.0]]
+    assert [note.partition(";")[0] for note in drawn.notes] == ["/n: 1 message left out"]
+
+
+def test_a_topic_in_an_unknown_encoding_is_left_out_and_said(tmp_path: Path) -> None:
+    log = write_json_log(tmp_path / "a.mcap", [("/odd", "Unheard", b"?"), ("/n", "Number", b'{"x": 1}')])
+    [note] = viewer.draw_log(log, tmp_path / "a.rrd").notes
+    assert note.startswith("/odd: left out")
+
+
+def test_nothing_to_draw_says_what_was_left_out(tmp_path: Path) -> None:
+    log = write_json_log(tmp_path / "a.mcap", [("/depth", *DEPTH)])
+    with pytest.raises(LogError, match=r"nothing to draw(.|\n)*/depth: 1 message left out"):
+        viewer.draw_log(log, tmp_path / "a.rrd")
+    assert not (tmp_path / "a.rrd").exists()
+
+
+def test_real_log_with_service_events_and_damaged_images_is_drawn() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder) / "a.rrd"
+        services = "logs/rosbag2_tests/rosbag2_cpp/test/rosbag2_cpp/bags/topics_and_services.mcap"
+        assert any("_service_event: left out" in note for note in viewer.draw_log(real_data(services), rrd).notes)
+        damaged = "logs/rosbags_rs_testbags/tests/test_bags/test_bag_mcap/test_bag_mcap.mcap"
+        assert any("/image: 2 messages left out" in note for note in viewer.draw_log(real_data(damaged), rrd).notes)
+
+
+# --- what cannot be written -------------------------------------------------------------------------------------------
+
+
+def test_a_folder_in_the_way_is_named_and_left_alone(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    (tmp_path / "out" / "a.rrd").mkdir(parents=True)
+    with pytest.raises(StoreError, match="a folder is in the way"):
+        viewer.draw_log(log.path, tmp_path / "out" / "a.rrd")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.rrd"]
+
+
+@pytest.mark.parametrize("in_the_way", [True, False])
+def test_a_folder_that_is_missing_or_a_file_is_wrong_use(tmp_path: Path, in_the_way: bool) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    if in_the_way:
+        (tmp_path / "out").write_bytes(b"")
+    with pytest.raises(UsageError, match="no such folder"):
+        viewer.draw_log(log.path, tmp_path / "out" / "a.rrd")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a folder that nobody, not even root, may write into")
+def test_a_folder_without_permission_is_a_plain_error(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    with pytest.raises(StoreError, match="the drawing cannot be written"):
+        viewer.draw_log(log.path, Path("/proc/a.rrd"))
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from vilp_data.errors import StoreError
+from vilp_data.viewer import draw_log
+limit = int(sys.argv[3])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+try:
+    draw_log(Path(sys.argv[1]), Path(sys.argv[2]))
+except StoreError as error:
+    print(error.what)
+"""
+
+
+@pytest.mark.parametrize("missing_bytes", [1, 100, 50_000])
+def test_a_full_disk_is_a_plain_error_and_leaves_nothing_behind(tmp_path: Path, missing_bytes: int) -> None:
+    log = write_mcap(tmp_path / "a.mcap", height=240, width=320, image_codec="raw", n_frames=4)
+    viewer.draw_log(log.path, tmp_path / "whole.rrd")
+    (tmp_path / "out").mkdir()
+    limit = (tmp_path / "whole.rrd").stat().st_size - missing_bytes
+    arguments = [str(log.path), str(tmp_path / "out" / "a.rrd"), str(limit)]
+    ended = subprocess.run([sys.executable, "-c", LIMITED, *arguments], capture_output=True, text=True, check=True)
+    assert "the drawing cannot be written" in ended.stdout
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 # --- ways to look at it -----------------------------------------------------------------------------------------------
 
 
@@ -276,9 +422,9 @@ def listening(process: psutil.Process) -> list[str]:
 SERVE = """
 import sys
 from pathlib import Path
-from vilp_data import viewer
+from vilp_data import viewer, viewer_window
 drawn = viewer.Drawn(Path(sys.argv[1]), "", {})
-viewer.serve_web(drawn, on_url=lambda url: print(url, flush=True), web_port=0, data_port=0)
+viewer_window.serve_web(drawn, on_url=lambda url: print(url, flush=True), web_port=0, data_port=0)
 """
 
 
@@ -308,7 +454,7 @@ def rerun_children() -> list[psutil.Process]:
     return psutil.Process(os.getpid()).children(recursive=True)
 
 
-def picture_or_skip(draw: viewer.Draw, png: Path) -> U8:
+def picture_or_skip(draw: viewer_window.Draw, png: Path) -> U8:
     try:
         viewer.present(draw, screenshot=png)
     except viewer_process.ViewerError as error:
@@ -355,7 +501,7 @@ def test_a_viewer_that_does_not_answer_in_time_is_ended(tmp_path: Path) -> None:
     drawn = viewer.draw_log(log.path, tmp_path / "a.rrd")
     before = rerun_children()
     with pytest.raises(viewer_process.ViewerError, match="did not"):
-        viewer.take_screenshot(drawn, tmp_path / "a.png", timeout_s=0.01)
+        viewer_window.take_screenshot(drawn, tmp_path / "a.png", timeout_s=0.01)
     assert rerun_children() == before
     assert not (tmp_path / "a.png").exists()
 

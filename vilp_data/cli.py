@@ -336,7 +336,8 @@ def view(
 
     if Path(target).exists():
         named = load_task(task) if task else None
-        draw = partial(draw_log, Path(target), episode=episode, spec=named)
+        rate_hz = named.rate_hz if named and named.rate_hz else 10.0
+        draw = partial(draw_log, Path(target), episode=episode, spec=named, array_rate_hz=rate_hz)
     else:
         root, spec = _dataset_with(target, data)
         encoders = _encoders_of(root, spec, encoder, run)

@@ -19,11 +19,12 @@ import torch
 from torch.utils.data import Dataset
 
 from vilp_data import shards, windows
+from vilp_data.dataset_split import side_episodes
+from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import SplitError, StoreError, UsageError, nearest
-from vilp_data.latents import latents_path
+from vilp_data.errors import StoreError, UsageError, nearest
+from vilp_data.latents import latents_path, open_latents
 from vilp_data.spec import WindowSpec
-from vilp_data.split_lock import SplitLock
 from vilp_data.types import I64
 
 # Linux allows a process 65,530 maps (vm.max_map_count); half of them are left to everything else.
@@ -36,7 +37,7 @@ _Layout = dict[str, tuple[tuple[int, ...], torch.dtype]]
 
 @dataclass(frozen=True)
 class WindowTensors:
-    """B windows as torch tensors, as stored: `types.WindowBatch` for training.
+    """B windows as torch tensors, as stored.
 
     frames        view -> uint8 [B,H,W,3]: the observation's image at the window's first step t; empty without frames
     latents       view -> float16 [B,N,c,h,w]: planned frames t+Δt … t+NΔt, before quantisation
@@ -123,14 +124,15 @@ class WindowDataset(Dataset[WindowTensors]):
         """Open the dataset at `root`. `latent_keys` names the encoder key of each view to read.
 
         Raises SplitError without a split that covers the episodes, UsageError for a view that does not exist, and
-        StoreError where latents are missing or no window fits. Latents that were made of other frames than today's are
-        a StoreError when a window first needs them.
+        StoreError where latents are missing or no window fits. Files that do not belong together (latents or frames of
+        another ingest, arrays of other lengths) are a StoreError when a window first needs them, by what their headers
+        say; bytes that changed on disk are found by whole reads alone (see `episode_files`).
         """
         self._store = EpisodeStore(Path(root))
         self._window = window
         self._latent_keys = dict(latent_keys)
         self._with_frames = with_frames
-        self._entries = _side(self._store, split)
+        self._entries = self._store.index() if split == "all" else side_episodes(self._store, split)
         _require_latents(self._store.root, self._entries, self._latent_keys)
         self._n_steps = np.array([entry.n_steps for entry in self._entries], np.int64)
         self._has_action = np.array([entry.has_action and with_actions for entry in self._entries], np.bool_)
@@ -170,7 +172,7 @@ class WindowDataset(Dataset[WindowTensors]):
     def read(self, numbers: Sequence[int] | I64, *, pin_memory: bool = False) -> WindowTensors:
         """Windows `numbers`, in that order, in memory of their own; `pin_memory` makes it page-locked.
 
-        Raises IndexError outside 0 … len - 1, and StoreError for files that are damaged, missing or stale."""
+        Raises IndexError outside 0 … len - 1, and StoreError for files that are missing, cut off, stale or foreign."""
         episode, step = self._index.locate(np.asarray(numbers, np.int64))
         n_plan_frames, frame_stride = self._window.n_plan_frames, self._window.frame_stride
         n_steps = self._n_steps[episode]
@@ -198,7 +200,8 @@ class WindowDataset(Dataset[WindowTensors]):
         for row, (number, first) in enumerate(zip(batch.episode.tolist(), batch.step.tolist(), strict=True)):
             arrays = self._open(number)
             low_dim[row] = arrays.low_dim[first]
-            # mode="clip" lets take() write in place; every index was checked when the episode was opened
+            # mode="clip" lets take() write in place. It hides no error: opening the episode checked that the steps cover it and
+            # that valid steps point at stored frames, and windows hold valid steps alone.
             if action is not None and arrays.action is not None:
                 arrays.action.take(acted[row], axis=0, out=action[row], mode="clip")
             for place, view in enumerate(arrays.views):
@@ -224,7 +227,7 @@ class WindowDataset(Dataset[WindowTensors]):
 
     def _open_episode(self, number: int) -> _Open:
         entry = self._entries[number]
-        steps = shards.open_shard(self._store.steps_path(entry.id)).arrays
+        steps = open_steps(self._store, entry, self._latent_keys)
         action = steps.get("action") if self._has_action[number] else None
         views = tuple(self._open_view(entry, view, steps) for view in self._latent_keys)
         opened = _Open(views, steps["low_dim"], action)
@@ -232,23 +235,9 @@ class WindowDataset(Dataset[WindowTensors]):
         return opened
 
     def _open_view(self, entry: EpisodeEntry, view: str, steps: Mapping[str, npt.NDArray[Any]]) -> _View:
-        path = latents_path(self._store.root, view, self._latent_keys[view], entry.id)
-        shard = shards.open_shard(path)
-        source, latents = steps[f"source_index/{view}"], shard.arrays["latents"]
-        of_today = shard.metadata.get("source_frames_sha256") == entry.frames_sha256[view]
-        if not of_today or len(latents) != entry.n_frames[view]:
-            raise StoreError("latents of other frames than the episode has today", where=path, remedy=_ENCODE)
-        used = source[steps["valid"]]
-        if used.size and (used.min() < 0 or used.max() >= len(latents)):
-            raise StoreError(
-                "steps that point past the stored frames",
-                where=self._store.steps_path(entry.id),
-                found=f"frames {used.min()} to {used.max()} of {len(latents)}",
-                remedy="run `vilp-data ingest` on its log again",
-            )
-        if not self._with_frames:
-            return _View(source, latents, None)
-        return _View(source, latents, shards.open_shard(self._store.frames_path(view, entry.id)).arrays["frames"])
+        latents = open_latents(self._store.root, entry, view, self._latent_keys[view])
+        frames = open_frames(self._store, entry, view) if self._with_frames else None
+        return _View(steps[f"source_index/{view}"], latents, frames)
 
     # --- shapes
 
@@ -334,35 +323,13 @@ def _block(n_bytes: int, *, pin_memory: bool) -> torch.Tensor:
     return torch.from_numpy(np.empty(n_bytes, np.uint8))
 
 
-def _side(store: EpisodeStore, split: Literal["train", "val", "all"]) -> list[EpisodeEntry]:
-    """The episodes of one side, sorted by id. SplitError without a lock that is intact and covers every episode."""
-    entries = store.index()
-    if split == "all":
-        return entries
-    path = store.root / "split.lock.json"
-    remedy = "run `vilp-data split`"
-    try:
-        lock = SplitLock.from_json(path.read_bytes(), where=path)
-    except FileNotFoundError as error:
-        raise SplitError("the dataset has not been split", where=store.root, remedy=remedy) from error
-    if not lock.is_intact:
-        raise SplitError(
-            "the split was changed by hand", where=path, remedy="restore it, or run `vilp-data split --redraw`"
-        )
-    unassigned = [entry.id for entry in entries if entry.id not in lock.assignment]
-    if unassigned:
-        found = f"{len(unassigned)} without a side, such as {unassigned[0]}"
-        raise SplitError("the split does not cover every episode", where=path, found=found, remedy=remedy)
-    return [entry for entry in entries if lock.assignment[entry.id] == split]
-
-
 def _valid_runs(store: EpisodeStore, entries: Sequence[EpisodeEntry]) -> tuple[I64, I64]:
     """The episode [R] of each run of valid steps int64 [R,2]; only episodes with invalid steps are opened for it."""
     episode, runs = [], []
     for number, entry in enumerate(entries):
         found = [(0, entry.n_steps)]
         if entry.n_valid < entry.n_steps:
-            valid = shards.open_shard(store.steps_path(entry.id)).arrays["valid"]
+            valid = open_steps(store, entry)["valid"]
             found = [(first, end) for first, end in windows.valid_runs(valid).tolist()]
         episode += [number] * len(found)
         runs += found

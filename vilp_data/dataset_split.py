@@ -9,10 +9,11 @@ import numpy as np
 
 from vilp_data import shards
 from vilp_data.duplicates import thumbnails
+from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError
 from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
-from vilp_data.split_lock import SplitLock
+from vilp_data.split_lock import Side, SplitLock
 
 
 def lock_path(root: Path) -> Path:
@@ -36,6 +37,22 @@ def read_split(root: Path) -> SplitLock:
 def find_split(root: Path) -> SplitLock | None:
     path = lock_path(root)
     return SplitLock.from_json(path.read_bytes(), where=path) if path.is_file() else None
+
+
+def side_episodes(store: EpisodeStore, side: Side) -> list[EpisodeEntry]:
+    """The stored episodes on one side of the split, sorted by id.
+
+    Raises SplitError as `read_split` does, and where a stored episode has no side yet."""
+    lock, entries = read_split(store.root), store.index()
+    unassigned = [entry.id for entry in entries if entry.id not in lock.assignment]
+    if unassigned:
+        raise SplitError(
+            "the split does not cover every episode",
+            where=lock_path(store.root),
+            found=f"{len(unassigned)} without a side, such as {unassigned[0]}",
+            remedy=f"run `vilp-data split {store.root}`: it places what is new and moves nothing",
+        )
+    return [entry for entry in entries if lock.assignment[entry.id] == side]
 
 
 def update_split(
@@ -102,6 +119,5 @@ def _thumbnails(store: EpisodeStore, entry: EpisodeEntry) -> np.ndarray[tuple[in
     """The first, middle and last frame of every view, small and grey: float32 [3V,8,8]."""
     rows = []
     for view in sorted(entry.frames_sha256):
-        frames = shards.open_shard(store.frames_path(view, entry.id)).arrays["frames"]
-        rows.append(thumbnails(frames))
+        rows.append(thumbnails(open_frames(store, entry, view)))
     return np.concatenate(rows)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
+
+from vilp_data.errors import VilpDataError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def cpu_count() -> int:
@@ -24,11 +33,14 @@ def map_unordered(
     workers: int,
     initializer: Callable[..., None] | None = None,
     initargs: tuple[Any, ...] = (),
-) -> Iterator[tuple[Item, Result]]:
+) -> Generator[tuple[Item, Result], None, None]:
     """Yield (item, function(item)) as each finishes; the first exception is raised here and cancels what has not begun.
 
     `function` and `items` must be picklable by reference (module-level functions, plain data): workers are spawned, never
     forked, since forked copies of threads that hold locks hang. With `workers` <= 1 all runs in this process.
+
+    Workers never outlive this process, however it ends, and leave Ctrl-C to it: a caller that holds a lock for them closes the
+    generator (`contextlib.closing`) before it lets go of the lock. Raises VilpDataError where a worker is killed from outside.
     """
     if not items:
         return
@@ -38,13 +50,60 @@ def map_unordered(
         for item in items:
             yield item, function(item)
         return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(items)), mp_context=context, initializer=initializer, initargs=initargs)
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        min(workers, len(items)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(os.getpid(), initializer, initargs),
+    )
     try:
-        pending: dict[Future[Result], Item] = {pool.submit(function, item): item for item in items}
+        pending = _submit(pool, function, items)
         while pending:
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield pending.pop(future), future.result()
+    except BrokenProcessPool as error:
+        raise VilpDataError(
+            "a worker process was killed, probably because memory ran out",
+            remedy="run it again with fewer --workers: what was finished is kept",
+        ) from error
+    except (KeyboardInterrupt, GeneratorExit):  # nobody waits for the rest, and every write is whole or not there
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.kill()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _submit(
+    pool: ProcessPoolExecutor, function: Callable[[Item], Result], items: Sequence[Item]
+) -> dict[Future[Result], Item]:
+    """Submit everything. The workers that this starts inherit a blocked SIGINT: Ctrl-C reaches every process of the terminal,
+    and only the parent should answer it, even while a worker is still importing."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return {pool.submit(function, item): item for item in items}
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(parent: int, initializer: Callable[..., None] | None, initargs: tuple[Any, ...]) -> None:
+    _die_with_parent(parent)
+    if initializer is not None:
+        initializer(*initargs)
+
+
+def _die_with_parent(parent: int) -> None:
+    """End this process when its parent ends, `kill -9` included: the parent's lock ends with it, and nobody may write without."""
+    if sys.platform != "linux" or ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
+        threading.Thread(target=_kill_after_parent, name="watch-parent", daemon=True).start()
+    elif os.getppid() != parent:  # it ended before the kernel was told
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _kill_after_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -22,7 +22,8 @@ from vilp_data.types import U8, Episode, Outcome
 
 @dataclass(frozen=True)
 class Origin:
-    """Where an episode came from: the log's file name and SHA-256, which demonstration in it, and the ingest spec used."""
+    """Where an episode came from: the log's file name, which demonstration in it, the SHA-256 of the log (of that demonstration's own
+    rows where the log can tell them apart), and the ingest spec used."""
 
     source: str
     source_sha256: str
@@ -98,6 +99,14 @@ class EpisodeStore:
             )
         return task_from_dict(table["spec"], where=str(path))
 
+    def task_name(self) -> str | None:
+        """The name of the task this dataset was ingested for; None where dataset.json is missing or damaged, as after a crash."""
+        try:
+            table = json.loads((self.root / "dataset.json").read_text(encoding="utf-8"))
+            return str(table["spec"]["name"])
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return None
+
     def write_spec(self, spec: TaskSpec) -> None:
         table = {"format": FORMAT_VERSION, "spec": spec.model_dump(mode="json", by_alias=True)}
         data = (
@@ -113,7 +122,9 @@ class EpisodeStore:
         """Write an episode's frames, then its steps. A crash in between leaves no episode, only frames that the next run replaces."""
         frames_sha256 = {view: content_digest(frames) for view, frames in episode.frames.items()}
         steps = self.steps_path(episode.id)
-        steps.unlink(missing_ok=True)  # the commit goes first, and comes back last
+        if steps.is_file():
+            steps.unlink()  # the commit goes first, and comes back last
+            shards.sync_folder(steps.parent)
         for view, frames in episode.frames.items():
             header = {"format": str(FORMAT_VERSION), "key": origin.key, "frames_sha256": frames_sha256[view]}
             shards.write_shard(self.frames_path(view, episode.id), {"frames": frames}, header)
@@ -133,7 +144,9 @@ class EpisodeStore:
         self.index_path.unlink(missing_ok=True)
 
     def write_index(self) -> None:
-        """Write episodes/index.parquet from the headers."""
+        """Write episodes/index.parquet from the headers; nothing where there is no episode."""
+        if not self._steps_files():
+            return
         rows = [_to_row(entry, self.steps_path(entry.id).stat().st_size) for entry in self._entries_from_headers()]
         with shards.atomic_file(self.index_path) as file:
             pq.write_table(pa.Table.from_pylist(rows, schema=_INDEX_SCHEMA), file)
@@ -189,6 +202,15 @@ class EpisodeStore:
                 remedy="run `vilp-data ingest` on its log again",
             )
         return cast(U8, shard.arrays["frames"])
+
+    def frames_fit(self, entry: EpisodeEntry) -> bool:
+        """Whether every view's frames file is there, whole by its size, and the one that the episode was committed with. Reads
+        headers only: a flipped pixel shows in `read_frames`."""
+        try:
+            headers = {view: shards.read_header(self.frames_path(view, entry.id)) for view in entry.frames_sha256}
+        except StoreError:
+            return False
+        return all(header.metadata.get("frames_sha256") == entry.frames_sha256[v] for v, header in headers.items())
 
     def _steps_files(self) -> list[Path]:
         return sorted((self.root / "episodes" / "steps").glob("[!.]*.safetensors"))

@@ -1,45 +1,70 @@
-"""Logs + a task spec -> the episode store: which demonstrations are new, which are fresh, and what kept the others out."""
+"""Logs + a task spec -> the episode store: do what the plan says, and report what became of every demonstration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 
 from vilp_data import shards
-from vilp_data.assemble import assemble_episode, outcome_of
+from vilp_data.assemble import assemble_episode
 from vilp_data.engine import map_unordered
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import AlignError, DecodeError, LogError, SpecError, UsageError, VilpDataError
-from vilp_data.keys import episode_key
+from vilp_data.ingest_plan import Plan, Planned, make_plan
+from vilp_data.log_files import find_logs
+from vilp_data.log_hashes import HashCache
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
-from vilp_data.types import LogEpisode
+from vilp_data.types import Episode, LogReader
 
 EPISODES_PER_JOB = 8
 """Demonstrations of one log that a worker takes at a time: few enough to share the work, many enough to open the log seldom."""
 
+RATE_TOLERANCE = 0.02
+"""How far the rate of an episode may lie from the others' where the spec states none: cameras are not exact."""
+
 
 @dataclass(frozen=True)
 class IngestJob:
-    """Some demonstrations of one log, for one worker."""
+    """Some demonstrations of one log, for one worker. `rate_hz`: that of the dataset's other episodes, None for the first."""
 
     root: Path
     spec: TaskSpec
-    log: Path
-    log_sha256: str
-    episodes: tuple[tuple[str, LogEpisode], ...]
+    episodes: tuple[Planned, ...]
+    rate_hz: float | None
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """An episode that was stored."""
+
+    rate_hz: float
+    findings: tuple[str, ...]
 
 
 @dataclass
 class IngestReport:
-    """What became of every demonstration found in the logs."""
+    """What became of every demonstration found in the logs.
+
+    written, fresh, left_out  ids of episodes: stored now, there already, and not wanted since they failed
+    replaced     those of `written` that took the place of an episode with other content, since their log changed
+    failed       (id, or name of a log) and why nothing came of it
+    findings     id -> what was masked or repeated in it
+    notes        sentences about logs whose name was met before with other content
+    passed_over  files in the folders given that look like logs of a format that is not read
+    """
 
     written: list[str] = field(default_factory=list)
+    replaced: list[str] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     failed: list[tuple[str, str]] = field(default_factory=list)
     findings: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    passed_over: list[str] = field(default_factory=list)
 
 
 def ingest_logs(
@@ -47,117 +72,97 @@ def ingest_logs(
     progress: Callable[[int, int], None] | None = None,
 ) -> IngestReport:  # fmt: skip
     """Ingest every demonstration of `logs` into the dataset at `root`. What is there under today's key is left alone; what cannot
-    be read is reported and keeps nothing else back. `progress(done, total)` counts demonstrations.
+    be read is reported and keeps nothing else back. `progress(done, total)` counts demonstrations. Which stored episode a changed
+    log belongs to is said in `ingest_plan`.
 
-    Raises UsageError where no log is found at a path, BusyError where another process writes the dataset."""
-    paths = find_logs(logs)
+    Raises UsageError where no log is found at a path, or the dataset is of another task or spec, BusyError where another process
+    writes it."""
+    found = find_logs(logs)
     store = EpisodeStore(root)
-    report = IngestReport()
     with shards.writer_lock(root):
-        store.write_spec(spec)
-        jobs = plan_jobs(paths, store, spec, report, include_failures=include_failures)
-        total = sum(len(job.episodes) for job in jobs)
-        if total:
+        cache = HashCache(root)
+        plan = make_plan(found.logs, store, spec, cache, include_failures=include_failures)
+        cache.save()
+        report = IngestReport(
+            fresh=plan.fresh, left_out=plan.left_out, failed=plan.failed, notes=plan.notes,
+            passed_over=[str(path) for path in found.passed_over],
+        )  # fmt: skip
+        if plan.fresh:
+            store.write_spec(spec)
+        if plan.todo:
             store.remove_index()
-        done = 0
-        for job, results in map_unordered(ingest_job, jobs, workers=workers if total > 1 else 1):
-            for (episode_id, _), result in zip(job.episodes, results, strict=True):
-                done += 1
+        with closing(_ingest(plan, root, spec, workers)) as results:  # so that no worker outlives the lock
+            for done, (planned, result) in enumerate(results, start=1):
                 if isinstance(result, VilpDataError):
-                    report.failed.append((episode_id, str(result)))
+                    report.failed.append((planned.id, str(result)))
                 else:
-                    report.written.append(episode_id)
-                    if result:
-                        report.findings[episode_id] = result
-            if progress is not None:
-                progress(done, total)
+                    if not report.written:
+                        store.write_spec(spec)  # not before: a spec that fits no log must not become the dataset's
+                    report.written.append(planned.id)
+                    report.findings |= {planned.id: result.findings} if result.findings else {}
+                if progress is not None:
+                    progress(done, len(plan.todo))
         if not store.index_path.is_file():
             store.write_index()
     report.written.sort()
     report.failed.sort()
+    report.replaced = sorted(plan.replaced.intersection(report.written))
     return report
 
 
-def find_logs(paths: Sequence[Path]) -> list[Path]:
-    """The logs at `paths`: a path that is a log itself, or every log in a folder. Sorted; UsageError for a path without any."""
-    found: dict[Path, None] = {}
-    for path in paths:
-        if not path.exists():
-            raise UsageError("no such file or folder", where=path, remedy="check the path")
-        if path.is_dir() and not (path / ".zgroup").is_file() and not (path / "zarr.json").is_file():
-            inside = [*sorted(path.rglob("*.mcap")), *sorted(p.parent for p in path.rglob("*.zarr/.zgroup"))]
-            if not inside:
-                raise UsageError(
-                    "no logs in this folder",
-                    where=path,
-                    found="no *.mcap file and no *.zarr folder",
-                    remedy="give the logs themselves, or their folder",
-                )
-            found.update(dict.fromkeys(inside))
-        else:
-            found[path] = None
-    return list(found)
-
-
-def plan_jobs(
-    paths: Sequence[Path], store: EpisodeStore, spec: TaskSpec, report: IngestReport, *, include_failures: bool
-) -> list[IngestJob]:
-    """What there is to do; fills `report` with what there is not (fresh, left out, unreadable)."""
-    fields = spec.ingest_fields()
-    present = {entry.id: entry for entry in store.index()}
-    by_origin = {(entry.source_sha256, entry.source_episode): entry.id for entry in present.values()}
+def _ingest(
+    plan: Plan, root: Path, spec: TaskSpec, workers: int
+) -> Generator[tuple[Planned, Ingested | VilpDataError], None, None]:
+    """Do what is to do. Where the spec states no rate, the first episode by id sets it for the dataset, and so goes before the
+    others: which are refused must not depend on the order in which workers end."""
+    rate_hz, todo = plan.rate_hz, list(plan.todo)
+    while spec.rate_hz is None and rate_hz is None and todo:
+        first = min(todo, key=lambda planned: planned.id)
+        todo.remove(first)
+        (result,) = ingest_job(IngestJob(root, spec, (first,), None))
+        rate_hz = None if isinstance(result, VilpDataError) else result.rate_hz
+        yield first, result
     jobs: list[IngestJob] = []
-    for path in paths:
-        try:
-            with open_log(path, array_rate_hz=spec.rate_hz or 10.0) as log:
-                sha256, demonstrations = log.sha256(), log.episodes()
-        except LogError as error:
-            report.failed.append((path.name, str(error)))
-            continue
-        if not demonstrations:
-            report.failed.append(
-                (path.name, str(LogError("the log holds no message", where=path, remedy="leave it out")))
-            )
-        todo: list[tuple[str, LogEpisode]] = []
-        for demonstration in demonstrations:
-            origin = (sha256, demonstration.name)
-            episode_id = by_origin.get(origin) or _free_id(
-                path, demonstration, sha256, present.keys() | by_origin.values(), only=len(demonstrations) == 1
-            )
-            key = episode_key(source_sha256=sha256, source_episode=demonstration.name, ingest_fields=fields)
-            if episode_id in present and present[episode_id].key == key:
-                report.fresh.append(episode_id)
-            elif outcome_of(demonstration.tags) == "failure" and not include_failures:
-                report.left_out.append(episode_id)
-            elif origin not in by_origin or episode_id in present:
-                todo.append((episode_id, demonstration))
-            by_origin[origin] = episode_id
-        jobs += [
-            IngestJob(store.root, spec, path, sha256, tuple(todo[i : i + EPISODES_PER_JOB]))
-            for i in range(0, len(todo), EPISODES_PER_JOB)
-        ]
-    return jobs
+    for _, group in groupby(todo, key=lambda planned: planned.source.log):
+        episodes = list(group)
+        parts = [tuple(episodes[i : i + EPISODES_PER_JOB]) for i in range(0, len(episodes), EPISODES_PER_JOB)]
+        jobs += [IngestJob(root, spec, part, rate_hz) for part in parts]
+    with closing(map_unordered(ingest_job, jobs, workers=workers if len(jobs) > 1 else 1)) as finished:
+        for job, results in finished:
+            yield from zip(job.episodes, results, strict=True)
 
 
-def _free_id(path: Path, demonstration: LogEpisode, sha256: str, taken: set[str], *, only: bool) -> str:
-    name = path.stem if only else f"{path.stem}-{demonstration.name}"
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-    return name if name not in taken else f"{name}-{sha256[:8]}"
+def ingest_job(job: IngestJob) -> list[Ingested | VilpDataError]:
+    """Ingest and store each demonstration of a job: what came of it, or the error that kept it out."""
+    try:
+        with open_log(job.episodes[0].source.log, array_rate_hz=job.spec.rate_hz or 10.0) as log:
+            return [_ingest_one(log, planned, job) for planned in job.episodes]
+    except (LogError, UsageError) as error:  # it was readable when the plan was made
+        return [error] * len(job.episodes)
 
 
-def ingest_job(job: IngestJob) -> list[tuple[str, ...] | VilpDataError]:
-    """Ingest and store each demonstration of a job: its findings, or the error that kept it out."""
-    store = EpisodeStore(job.root)
-    results: list[tuple[str, ...] | VilpDataError] = []
-    with open_log(job.log, array_rate_hz=job.spec.rate_hz or 10.0) as log:
-        for episode_id, demonstration in job.episodes:
-            try:
-                episode = assemble_episode(log, demonstration, job.spec, episode_id=episode_id)
-            except (LogError, DecodeError, AlignError, SpecError) as error:
-                results.append(error)
-                continue
-            fields = job.spec.ingest_fields()
-            key = episode_key(source_sha256=job.log_sha256, source_episode=demonstration.name, ingest_fields=fields)
-            store.write(episode, Origin(job.log.name, job.log_sha256, demonstration.name, key, fields))
-            results.append(episode.findings)
-    return results
+def _ingest_one(log: LogReader, planned: Planned, job: IngestJob) -> Ingested | VilpDataError:
+    source = planned.source
+    try:
+        episode = assemble_episode(log, source.demonstration, job.spec, episode_id=planned.id)
+        _refuse_another_rate(episode, job.rate_hz, source.log)
+    except (LogError, DecodeError, AlignError, SpecError) as error:
+        return error
+    except MemoryError:
+        where = f"{source.log}, {source.demonstration.name}"
+        return LogError(
+            "does not fit in memory", where=where, remedy="fewer --workers, smaller views, or a shorter log"
+        )
+    fields = job.spec.ingest_fields()
+    origin = Origin(source.log.name, source.sha256, source.demonstration.name, planned.key, fields)
+    EpisodeStore(job.root).write(episode, origin)
+    return Ingested(episode.rate_hz, episode.findings)
+
+
+def _refuse_another_rate(episode: Episode, rate_hz: float | None, path: Path) -> None:
+    if rate_hz is not None and abs(episode.rate_hz / rate_hz - 1) > RATE_TOLERANCE:
+        raise AlignError(
+            f"its slowest camera runs at {episode.rate_hz:.4g} Hz, while the dataset's episodes have {rate_hz:.4g} steps a second",
+            where=f"{path}, {episode.id}",
+            remedy="state rate_hz in the task TOML, so that all are put on one clock",
+        )

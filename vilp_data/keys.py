@@ -30,7 +30,25 @@ def content_digest(*arrays: npt.NDArray[Any]) -> str:
 
 
 def episode_key(*, source_sha256: str, source_episode: str, ingest_fields: Mapping[str, Any]) -> str:
-    """Key of an ingested episode: the log's bytes, which demonstration in it, the resolved ingest spec, the format version."""
+    """Key of an ingested episode: the SHA-256 of its source (a log, or one demonstration of a log that can tell its demonstrations
+    apart), the demonstration's name, the resolved ingest spec, the format version."""
     return digest(
         {"format": FORMAT_VERSION, "source": source_sha256, "episode": source_episode, "ingest": dict(ingest_fields)}
     )
+
+
+def first_difference(old: Any, new: Any, path: str = "") -> str | None:
+    """`views.front.height: 96 -> 128`, for the first place in sorted order where plain data differs; None where nothing does."""
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for key in sorted({*old, *new}):
+            place = f"{path}.{key}" if path else str(key)
+            if key not in old or key not in new:
+                return f"{place}: {'added' if key not in old else 'removed'}"
+            difference = first_difference(old[key], new[key], place)
+            if difference is not None:
+                return difference
+        return None
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        differences = (first_difference(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(old, new, strict=True)))
+        return next((difference for difference in differences if difference is not None), None)
+    return None if old == new else f"{path}: {json.dumps(old)} -> {json.dumps(new)}"

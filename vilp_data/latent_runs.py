@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy.typing as npt
 
 from vilp_data import shards
-from vilp_data.dataset_split import find_split
-from vilp_data.episodes import EpisodeStore
+from vilp_data.dataset_split import find_split, side_episodes
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.keys import digest
-from vilp_data.latents import encode_episodes, latents_path, load_encoder, missing_latents
+from vilp_data.latents import LatentJob, encode_episodes, load_encoder, missing_latents, open_latents
 from vilp_data.spec import TaskSpec
 from vilp_data.stats import ChannelStats
+
+EncodingProgress = Callable[[int, int, float], None]
+"""Told (frames done, frames in all, frames/s that bare forward passes of the same workers would reach)."""
 
 
 @dataclass
@@ -24,7 +25,8 @@ class EncodedDataset:
     """What `encode_dataset` found and did.
 
     keys       view -> the encoder's key, the name of the folder under latents/<view>/
-    shards     view -> how many there are now; written: how many of them are new
+    shards     view -> how many fit today's episodes: one each, as the call ends only when none is missing
+    written    view -> how many of them are new
     frames     frames encoded now, and their rate over all workers beside the rate of bare forward passes
     unseen     training episodes that the encoder was not trained on, having come later
     """
@@ -70,48 +72,55 @@ def encode_dataset(
     run_dir: Path,
     *,
     workers: int,
-    progress: Callable[[int, int, float], None] | None = None,
+    progress: EncodingProgress | None = None,
 ) -> EncodedDataset:
     """Make every latent shard that is missing or stale under the encoder of `run_dir`, then the training statistics.
 
-    `progress(frames done, frames in all, bare frames/s)`. Raises what the encoder's loading and the stores raise."""
+    An encoder that is not `parallel` gets one worker. Without a split there are no statistics. Raises what the encoder's
+    loading, the split's reading and the stores raise, before anything is encoded where that can be known."""
     store = EpisodeStore(root)
     encoders = {view: load_encoder(encoder_name, run_dir, view) for view in sorted(spec.views)}
     for view, view_spec in spec.views.items():
         encoders[view].latent_shape(view_spec.height, view_spec.width)
+    if not all(encoder.parallel for encoder in encoders.values()):
+        workers = 1
     done = EncodedDataset({view: encoder.key for view, encoder in encoders.items()})
     with shards.writer_lock(root):
-        entries = {entry.id: entry for entry in store.index()}
+        train = side_episodes(store, "train") if find_split(root) is not None else []
         jobs = missing_latents(store, encoder_name, run_dir, done.keys)
-        total = sum(entries[job.episode_id].n_frames[job.view] for job in jobs)
-        workers = max(1, min(workers, len(jobs)))
-        seconds, bare = 0.0, 0.0
-        done.written = dict.fromkeys(done.keys, 0)
-        for job, shard in encode_episodes(jobs, workers=workers):
+        _encode(store, jobs, done, workers=max(1, min(workers, len(jobs))), progress=progress)
+        done.shards = dict.fromkeys(done.keys, len(store.index()))
+        done.unseen = tuple(
+            entry.id for entry in train if any(entry.key not in encoder.trained_on for encoder in encoders.values())
+        )
+        if train:
+            write_stats(root, done.keys, train)
+    return done
+
+
+def _encode(
+    store: EpisodeStore,
+    jobs: Sequence[LatentJob],
+    done: EncodedDataset,
+    *,
+    workers: int,
+    progress: EncodingProgress | None,
+) -> None:
+    """Make the shards and enter into `done` how many and how fast."""
+    entries = {entry.id: entry for entry in store.index()}
+    total = sum(entries[job.episode_id].n_frames[job.view] for job in jobs)
+    seconds, bare = 0.0, 0.0
+    done.written = dict.fromkeys(done.keys, 0)
+    with contextlib.closing(encode_episodes(jobs, workers=workers)) as made:
+        for job, shard in made:
             done.frames += shard.frames
             done.written[job.view] += 1
             seconds += shard.seconds
             bare += shard.frames / shard.bare_frames_per_s
-            if progress is not None:
-                progress(done.frames, total, workers * done.frames / bare)
-        if seconds:
             done.frames_per_s = workers * done.frames / seconds
             done.bare_frames_per_s = workers * done.frames / bare
-        done.shards = dict.fromkeys(done.keys, len(entries))
-        train = training_episodes(store)
-        done.unseen = tuple(
-            id for id in train if any(entries[id].key not in encoder.trained_on for encoder in encoders.values())
-        )
-        if train:
-            write_stats(root, done.keys, {id: entries[id].key for id in train})
-    return done
-
-
-def training_episodes(store: EpisodeStore) -> list[str]:
-    """Stored episodes on the training side; none without a split."""
-    split = find_split(store.root)
-    present = {entry.id for entry in store.index()}
-    return [episode for episode in split.ids("train") if episode in present] if split else []
+            if progress is not None:
+                progress(done.frames, total, done.bare_frames_per_s)
 
 
 def stats_path(root: Path, view: str, key: str, train: Mapping[str, str]) -> Path:
@@ -119,15 +128,10 @@ def stats_path(root: Path, view: str, key: str, train: Mapping[str, str]) -> Pat
     return root / "latents" / view / key / f"stats-{digest(dict(train))[:16]}.json"
 
 
-def write_stats(root: Path, keys: Mapping[str, str], train: Mapping[str, str]) -> None:
+def write_stats(root: Path, keys: Mapping[str, str], train: Sequence[EpisodeEntry]) -> None:
     """Per-channel statistics of the training episodes' latents, one file a view, once for each training set."""
     for view, key in keys.items():
-        path = stats_path(root, view, key, train)
+        path = stats_path(root, view, key, {entry.id: entry.key for entry in train})
         if not path.is_file():
-            stats = ChannelStats.over(_latents(root, view, key, list(train)), channel_axis=1)
+            stats = ChannelStats.over((open_latents(root, entry, view, key) for entry in train), channel_axis=1)
             shards.write_atomic(path, stats.to_json(view=view, key=key))
-
-
-def _latents(root: Path, view: str, key: str, episodes: list[str]) -> Iterator[npt.NDArray[Any]]:
-    for episode in episodes:
-        yield shards.open_shard(latents_path(root, view, key, episode)).arrays["latents"]

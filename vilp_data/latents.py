@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
-import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, cast
@@ -15,13 +15,15 @@ import numpy as np
 
 from vilp_data import shards
 from vilp_data.engine import map_unordered
+from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import StoreError, UsageError, nearest
 from vilp_data.keys import FORMAT_VERSION
 from vilp_data.types import F16, U8
 
 BATCH = 16
-"""Frames encoded at a time. Batches never cross episodes, so an episode's bytes do not depend on its neighbours."""
+"""Frames encoded at a time. Batches never cross episodes, so an episode's bytes do not depend on its neighbours. Another
+number may give other bits: raise `keys.FORMAT_VERSION` with it."""
 
 BARE_BATCHES = 5
 """Batches that the bare forward loop is timed on."""
@@ -37,7 +39,13 @@ class FrameEncoder(Protocol):
 
     @property
     def key_fields(self) -> dict[str, str]:
-        """What goes into the key, by name, so that a stale latent can say why: weights, scaling, compute and storage dtype."""
+        """What goes into the key, by name, so that a stale latent can say why: weights, architecture, scaling, compute and
+        storage dtype, kind of device."""
+        ...
+
+    @property
+    def parallel(self) -> bool:
+        """Whether several processes may each hold one and encode at a time; False where they would share one accelerator."""
         ...
 
     @property
@@ -72,10 +80,19 @@ class LatentJob:
 
 def load_encoder(encoder_name: str, run_dir: Path, view: str) -> FrameEncoder:
     """The FrameEncoder that the entry-point group `vilp.frame_encoders` knows as `encoder_name`, for one view of a run."""
-    found = {point.name: point for point in importlib.metadata.entry_points(group="vilp.frame_encoders")}
+    found = _installed_encoders()
     if encoder_name not in found:
         raise UsageError(f"no frame encoder called {encoder_name!r} is installed", remedy=nearest(encoder_name, found))
     return cast(FrameEncoder, found[encoder_name].load()(run_dir, view))
+
+
+def encoder_names() -> list[str]:
+    """The kinds of frame encoder that are installed."""
+    return sorted(_installed_encoders())
+
+
+def _installed_encoders() -> dict[str, importlib.metadata.EntryPoint]:
+    return {point.name: point for point in importlib.metadata.entry_points(group="vilp.frame_encoders")}
 
 
 def latents_path(root: Path, view: str, key: str, episode_id: str) -> Path:
@@ -87,11 +104,31 @@ def stale_reason(root: Path, entry: EpisodeEntry, view: str, key: str) -> str | 
     path = latents_path(root, view, key, entry.id)
     if not path.is_file():
         return "not encoded yet"
-    metadata = shards.read_header(path).metadata
-    if metadata.get("format") != str(FORMAT_VERSION):
-        return f"format {metadata.get('format')} instead of {FORMAT_VERSION}"
+    header = shards.read_header(path)
+    if header.metadata.get("format") != str(FORMAT_VERSION):
+        return f"format {header.metadata.get('format')} instead of {FORMAT_VERSION}"
+    return _other_frames(header.metadata, header.tensors["latents"].shape[0], entry, view)
+
+
+def open_latents(root: Path, entry: EpisodeEntry, view: str, key: str) -> F16:
+    """The mapped latents float16 [n,c,h,w] of one episode and view: by their header, those of the frames it has today.
+
+    Raises StoreError where they are missing or of other frames. Bytes are not checksummed: see `episode_files`."""
+    path = latents_path(root, view, key, entry.id)
+    shard = shards.open_shard(path)
+    latents = shard.arrays["latents"]
+    why = _other_frames(shard.metadata, len(latents), entry, view)
+    if why is not None:
+        remedy = "run `vilp-data latents`"
+        raise StoreError("latents of other frames than the episode has today", where=path, found=why, remedy=remedy)
+    return cast(F16, latents)
+
+
+def _other_frames(metadata: Mapping[str, str], n_latents: int, entry: EpisodeEntry, view: str) -> str | None:
     if metadata.get("source_frames_sha256") != entry.frames_sha256[view]:
         return "the episode's frames changed (source_frames_sha256)"
+    if n_latents != entry.n_frames[view]:
+        return f"{n_latents} latents of {entry.n_frames[view]} frames"
     return None
 
 
@@ -114,10 +151,15 @@ class EncodedShard:
     bare_frames_per_s: float
 
 
-def encode_episodes(jobs: Sequence[LatentJob], *, workers: int) -> Iterator[tuple[LatentJob, EncodedShard]]:
-    """Make the shards, yielding each as it is done. Each worker computes on one thread, so bytes do not depend on how many
-    there are. Call inside `shards.writer_lock`. Killed at any moment, the next call makes what is missing."""
-    yield from map_unordered(encode_one, jobs, workers=workers, initializer=_one_thread)
+def encode_episodes(
+    jobs: Sequence[LatentJob], *, workers: int
+) -> Generator[tuple[LatentJob, EncodedShard], None, None]:
+    """Make the shards, yielding each as it is done. Workers compute on one thread each, this process included while it is the
+    only one, so bytes do not depend on how many there are. Call inside `shards.writer_lock`, and close the generator before
+    letting go of it. Killed at any moment, the next call makes what is missing."""
+    made = map_unordered(encode_one, jobs, workers=workers, initializer=_compute_on_one_thread)
+    with _threads_restored(), contextlib.closing(made):
+        yield from made
 
 
 def encode_one(job: LatentJob) -> EncodedShard:
@@ -161,7 +203,7 @@ def _bare_frames_per_s(job: LatentJob, store: EpisodeStore, entry: EpisodeEntry)
     since other workers may still be starting; once for each worker process, run and view."""
     name = (job.encoder_name, job.run_dir, job.view)
     if name not in _bare_rates:
-        frames = np.array(shards.open_shard(store.frames_path(job.view, entry.id)).arrays["frames"][:BATCH])
+        frames = np.array(open_frames(store, entry, job.view)[:BATCH])
         _encoder_of(job).encode(frames)
         seconds = []
         for _ in range(BARE_BATCHES):
@@ -173,9 +215,9 @@ def _bare_frames_per_s(job: LatentJob, store: EpisodeStore, entry: EpisodeEntry)
 
 
 def _encoder_of(job: LatentJob) -> FrameEncoder:
-    """One encoder per worker process, run and view."""
+    """One encoder per worker process, run and view; loaded again where the run was trained on since."""
     name = (job.encoder_name, job.run_dir, job.view)
-    if name not in _encoders:
+    if name not in _encoders or _encoders[name].key != job.key:
         _encoders[name] = load_encoder(*name)
     if _encoders[name].key != job.key:
         raise StoreError(
@@ -184,9 +226,20 @@ def _encoder_of(job: LatentJob) -> FrameEncoder:
     return _encoders[name]
 
 
-def _one_thread() -> None:
+def _compute_on_one_thread() -> None:
     """Sums in another order give other bits: workers compute on one thread each, and there are as many workers as cores."""
     import torch
 
-    os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+
+
+@contextlib.contextmanager
+def _threads_restored() -> Iterator[None]:
+    """Give this process its thread count back: without workers of their own, `_compute_on_one_thread` runs in it."""
+    import torch
+
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_image
+from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_image, is_wall_clock
 from vilp_data.errors import VilpDataError
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.types import I64, Message, TopicInfo
 
 GLANCE = 20  # messages of a topic that are decoded
-EARLIEST_WALL_NS = (
-    946_684_800 * 1_000_000_000
-)  # the year 2000: earlier stamps are simulated time, or a clock that was never set
 FAR_APART_S = 1.0  # a header this far from the log time is worth a word
 SHOWN_METADATA = 60  # characters of a metadata value in the terminal
-CLOCKS = {"wall": "wall clock", "simulated": "simulated clock", "none": "row count over rate"}
+CLOCKS = {"wall": "wall clock", "simulated": "simulated clock", "none": "the row's number over an assumed rate"}
 
 
 @dataclass(frozen=True)
@@ -52,6 +49,7 @@ class LogSummary:
     """A whole log. `sampled` names the figures that rest on a part of it only.
 
     log_clock       "wall", "simulated" (starting before the year 2000), or "none" for logs whose rows carry no time
+    assumed_rate_hz the rate that stands in for time where rows carry none, so rates and durations follow from it; else None
     """
 
     path: str
@@ -61,6 +59,7 @@ class LogSummary:
     start_ns: int | None
     duration_s: float
     log_clock: str
+    assumed_rate_hz: float | None
     topics: tuple[TopicSummary, ...]
     metadata: dict[str, dict[str, str]]
     sampled: tuple[str, ...]
@@ -78,6 +77,7 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
         topics = tuple(_topic(log, topic, times.get(topic.name)) for topic in log.topics())
         start_ns = episodes[0].start_ns if episodes else None
         duration_s = (episodes[-1].end_ns - episodes[0].start_ns) / 1e9 if episodes else 0.0
+        timeless = log.format == "zarr"
         return LogSummary(
             path=str(path),
             format=log.format,
@@ -85,7 +85,8 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
             n_episodes=len(episodes),
             start_ns=start_ns,
             duration_s=duration_s,
-            log_clock="none" if start_ns is None or log.format == "zarr" else _clock_kind(start_ns),
+            log_clock="none" if start_ns is None or timeless else _clock_kind(start_ns),
+            assumed_rate_hz=array_rate_hz if timeless else None,
             topics=topics,
             metadata=log.metadata(),
             sampled=_sampled(complete, times, start_ns),
@@ -157,7 +158,7 @@ def _header_clock(messages: list[Message]) -> tuple[str | None, float | None]:
 
 
 def _clock_kind(time_ns: int) -> str:
-    return "wall" if time_ns >= EARLIEST_WALL_NS else "simulated"
+    return "wall" if is_wall_clock(time_ns) else "simulated"
 
 
 def _size(path: Path) -> int:
@@ -215,6 +216,11 @@ def _warnings(summary: LogSummary) -> list[str]:
     lines = []
     if summary.log_clock == "simulated":
         lines.append("log time starts before the year 2000: simulated time, or a recorder whose clock was never set")
+    if summary.assumed_rate_hz is not None:
+        lines.append(
+            f"its rows carry no time: {summary.assumed_rate_hz:g} rows a second are assumed, and rates, gaps and duration follow"
+            " from that; a task's rate_hz takes their place"
+        )
     for topic in summary.topics:
         if topic.note:
             lines.append(f"{topic.name}: {topic.note}")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from vilp_data.message_body import set_members
 from vilp_data.types import Message
 
 LARGEST_VECTOR = 32
@@ -40,7 +41,7 @@ def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
     elif isinstance(value, np.ndarray) or _is_list(value):
         yield from _list_leaves(value, path, ())
     else:
-        fields = dict(_fields(value))
+        fields = dict(set_members(value))
         names = _texts(fields.get("name"))
         for name, inside in fields.items():
             if name in STAMPS:
@@ -76,21 +77,6 @@ def _numbers(values: Any) -> list[float] | None:
     return array.astype(np.float64).tolist() if array.ndim == 1 and array.dtype.kind in "fiub" else None
 
 
-def _fields(value: Any) -> Iterator[tuple[str, Any]]:
-    """(name, value) of a message's fields that are set: a dict, a protobuf message or a deserialised ROS message."""
-    if isinstance(value, Mapping):
-        yield from ((str(key), inside) for key, inside in value.items())
-        return
-    descriptor = getattr(value, "DESCRIPTOR", None)
-    if descriptor is not None:
-        for field in descriptor.fields:
-            if not field.has_presence or value.HasField(field.name):
-                yield field.name, getattr(value, field.name)
-        return
-    names: Sequence[str] = tuple(getattr(value, "__dataclass_fields__", ()))
-    yield from ((name, getattr(value, name)) for name in names if not name.startswith("_"))
-
-
 def _is_list(value: Any) -> bool:
     return isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
 
@@ -100,5 +86,5 @@ def _texts(value: Any) -> Sequence[str]:
 
 
 def _item_name(item: Any) -> str | None:
-    fields = dict(_fields(item))
+    fields = dict(set_members(item))
     return next((str(fields[name]) for name in ITEM_NAMES if isinstance(fields.get(name), str) and fields[name]), None)

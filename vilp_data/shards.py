@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import struct
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 _ALIGNMENT = 64
 _MAX_HEADER_BYTES = 16 * 1024 * 1024
 _CHECKSUM = "sha256"
+_LEFTOVER_AGE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +160,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except OSError as error:
         raise StoreError(
             "cannot be written",
@@ -198,17 +200,25 @@ def writer_lock(root: Path) -> Iterator[None]:
 
 def _remove_leftovers(root: Path) -> None:
     for folder in ("", "episodes", "latents", "action_sets"):
-        base = root / folder
-        if base.is_dir():
-            for leftover in base.glob("**/.*.tmp") if folder else base.glob(".*.tmp"):
+        for leftover in _temporary_files(root, folder):
+            leftover.unlink(missing_ok=True)
+    # Recorders and trainers write here without this lock: only what is surely nobody's goes.
+    for folder in ("logs", "runs"):
+        for leftover in _temporary_files(root, folder):
+            if time.time() - leftover.stat().st_mtime > _LEFTOVER_AGE_S:
                 leftover.unlink(missing_ok=True)
+
+
+def _temporary_files(root: Path, folder: str) -> list[Path]:
+    return list((root / folder).glob("**/.*.tmp" if folder else ".*.tmp"))
 
 
 def _bytes(array: npt.NDArray[Any]) -> memoryview:
     return array.reshape(-1).view(np.uint8).data
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Make renames and deletions in a folder survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from vilp_data import shards
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import VilpDataError
-from vilp_data.latents import latents_path, load_encoder, stale_reason
+from vilp_data.keys import first_difference
+from vilp_data.latents import FrameEncoder, encoder_names, latents_path, load_encoder, stale_reason
 from vilp_data.spec import TaskSpec
 
 
@@ -29,12 +30,14 @@ def stale_latents(root: Path, spec: TaskSpec) -> dict[str, str]:
     """latents/<view> (or one shard of it) -> why no shard there fits the trained encoders under runs/."""
     store = EpisodeStore(root)
     reasons: dict[str, str] = {}
-    for run in sorted(path for path in (root / "runs").glob("*-*") if path.is_dir()):
+    for run in sorted(path for path in (root / "runs").glob("*") if path.is_dir()):
         for view in spec.views:
             try:
-                encoder = load_encoder(run.name.split("-")[0], run, view)
+                encoder = _encoder_of(run, view)
             except VilpDataError as error:
                 reasons[str(run)] = str(error)
+                continue
+            if encoder is None:
                 continue
             folder = root / "latents" / view / encoder.key
             if not folder.is_dir():
@@ -52,21 +55,16 @@ def stale_latents(root: Path, spec: TaskSpec) -> dict[str, str]:
     return reasons
 
 
-def first_difference(old: Any, new: Any, path: str = "") -> str | None:
-    """`views.front.height: 96 -> 128`, for the first place in sorted order where plain data differs; None where nothing does."""
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for key in sorted({*old, *new}):
-            place = f"{path}.{key}" if path else str(key)
-            if key not in old or key not in new:
-                return f"{place}: {'added' if key not in old else 'removed'}"
-            difference = first_difference(old[key], new[key], place)
-            if difference is not None:
-                return difference
-        return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        differences = (first_difference(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(old, new, strict=True)))
-        return next((difference for difference in differences if difference is not None), None)
-    return None if old == new else f"{path}: {json.dumps(old)} -> {json.dumps(new)}"
+def _encoder_of(run: Path, view: str) -> FrameEncoder | None:
+    """The encoder that was trained into `run`: of the kind whose name the folder begins with, as `find_run` reads it, else of
+    the first kind that loads. None for the run of another model."""
+    named = [name for name in encoder_names() if run.name.startswith(name)]
+    if named:
+        return load_encoder(max(named, key=len), run, view)
+    for name in encoder_names():
+        with contextlib.suppress(VilpDataError):
+            return load_encoder(name, run, view)
+    return None
 
 
 def _against_other_keys(folder: Path, fields: Mapping[str, str]) -> str:

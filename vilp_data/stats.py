@@ -53,7 +53,7 @@ class ChannelStats:
             raise VilpDataError(
                 "values that are not finite",
                 found=f"NaN or infinity in channel {', '.join(map(str, np.flatnonzero(broken)))}",
-                remedy="leave invalid steps out, or find where they come from with `vilp-data check`",
+                remedy="leave invalid steps out; where valid ones hold such values, ingest or encode that episode again",
             )
         mean = np.clip(rows.mean(axis=1), low, high)  # the rounded mean of equal values may miss them by an ulp
         return cls(rows.shape[1], mean, np.square(rows - mean[:, None]).sum(axis=1), low, high)

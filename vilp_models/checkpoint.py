@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vilp_data.errors import StoreError, UsageError, nearest
-from vilp_data.shards import read_header, read_shard, write_atomic, write_shard
+from vilp_data.shards import open_shard, read_header, read_shard, verify_shard, write_atomic, write_shard
 
 FORMAT = "vilp-checkpoint-1"
 FILE = "checkpoint.safetensors"
@@ -32,7 +32,8 @@ class RunState:
     step            optimiser steps done
     steps           steps in all; the run is finished when they are equal
     views           views whose frames it sees
-    split_hash      hash of the split that chose the episodes
+    split_hash      hash of the split that chose the episodes, to find the lock in a project's history. It decides nothing: a
+                    split that only grew has another hash, so what is compared is train_episodes
     train_episodes  episode id -> episode key, of every training episode
     """
 
@@ -98,8 +99,10 @@ def load_checkpoint(run: Path) -> Checkpoint:
 
 
 def model_tensors(run: Path) -> Arrays:
-    """The network's tensors alone, writable, checksum verified."""
-    return load_checkpoint(run).model
+    """The network's tensors alone, writable, checksum verified; what resuming needs besides is not kept in memory."""
+    _header(run)
+    verify_shard(run / FILE)
+    return _under("model/", open_shard(run / FILE).arrays)
 
 
 def read_recipe(run: Path) -> dict[str, Any]:

@@ -59,22 +59,20 @@ def train_vqgan(
 
     Example: vilp-models train vqgan --task hanoi --preset cpu
     """
-    from vilp_data.dataset_split import read_split
+    from vilp_data.dataset_split import read_split, side_episodes
     from vilp_models.recipe import vqgan_recipe
     from vilp_models.train import train_vqgan as train
 
     root, spec = _dataset(data, task, preset)
-    split = read_split(root)
-    present = {entry.id for entry in EpisodeStore(root).index()}
-    episodes = [episode for episode in split.ids("train") if episode in present]
-    recipe = vqgan_recipe(spec.models, where=spec.name)
+    episodes = side_episodes(EpisodeStore(root), "train")
+    recipe = vqgan_recipe(spec.models, preset=preset, where=spec.name)
     train(
         root,
         spec,
         recipe,
         run or default_run(root, preset),
-        train_episodes=episodes,
-        split_hash=split.hash,
+        train_episodes=[entry.id for entry in episodes],
+        split_hash=read_split(root).hash,
         restart=restart,
     )
 
@@ -91,7 +89,7 @@ def evaluate_vqgan(
 
     Example: vilp-models evaluate vqgan --run data/hanoi/runs/vqgan-cpu
     """
-    from vilp_data.dataset_split import read_split
+    from vilp_data.dataset_split import side_episodes
     from vilp_data.latent_runs import find_run
     from vilp_models.fidelity import fidelity_report, report_inputs
     from vilp_models.fidelity_page import read_fresh_report, write_report
@@ -99,12 +97,11 @@ def evaluate_vqgan(
     root, _ = _dataset(data, None, None)
     folder = find_run(root, run, "vqgan")
     store = EpisodeStore(root)
-    present = {entry.id: entry for entry in store.index()}
-    episodes = [episode for episode in read_split(root).ids("val") if episode in present]
+    episodes = [entry.id for entry in side_episodes(store, "val")]
     inputs = report_inputs(store, folder, episodes)
     table = read_fresh_report(folder / "fidelity", inputs)
     if table is None:
-        with progress_bar("fidelity", sum(sum(present[id].n_frames.values()) for id in episodes)) as advance:
+        with progress_bar("fidelity", None) as advance:
             report = fidelity_report(store, folder, episodes, progress=advance)
         write_report(report, folder / "fidelity", inputs)
         table = read_fresh_report(folder / "fidelity", inputs)
@@ -121,7 +118,7 @@ def rollout(
         str, typer.Option(help="replay: the recorded actions, from the recorded first state.")
     ] = "replay",
     episodes: Annotated[
-        int | None, typer.Option(help="How many of the dataset's episodes. Default: all.", show_default=False)
+        int | None, typer.Option(min=1, help="How many of the dataset's episodes. Default: all.", show_default=False)
     ] = None,
     render: Annotated[
         bool, typer.Option("--render", help="Also draw the recorded states and compare with the stored frames.")

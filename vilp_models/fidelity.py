@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError, UsageError, nearest
+from vilp_data.keys import digest
 from vilp_data.latents import BATCH, encode_batches, latents_path, stale_reason
-from vilp_data.shards import open_shard, read_shard
+from vilp_data.shards import read_shard
 from vilp_data.types import F16, I64, U8
 from vilp_models.checkpoint import checkpoint_digest, read_state, run_for_view
 from vilp_models.lpips import Lpips, load_lpips
@@ -31,6 +33,10 @@ PRECISION_STRIDE = 8
 
 WORST_FRAMES, WORST_GAP = 6, 10
 """Frames a view on the contact sheet, and how far apart they are in one episode."""
+
+
+Progress = Callable[[int, int], None]
+"""Told (frames done, frames in all), every view's counted."""
 
 
 @dataclass(frozen=True)
@@ -185,10 +191,10 @@ def fidelity_report(
     episodes: Sequence[str],
     *,
     views: Sequence[str] | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> FidelityReport:
     """Measure the VQGANs in `run_dir` on validation `episodes`: stored float16 latents (encoded here where there are
-    none), quantised, then decoded. `progress` is told the number of frames done since the last call.
+    none), quantised, then decoded.
 
     Raises SplitError where an episode was trained on, UsageError for an unknown episode or a view without a VQGAN.
     """
@@ -200,16 +206,24 @@ def fidelity_report(
         raise UsageError(
             "no validation episode to report on", where=store.root, remedy="draw a split with `vilp-data split`"
         )
+    views = views or sorted(store.spec().views)
+    chosen = [entries[episode] for episode in sorted(episodes)]
+    done, total = 0, sum(entry.n_frames[view] for entry in chosen for view in views)
+
+    def advance(frames: int) -> None:
+        nonlocal done
+        done += frames
+        if progress is not None:
+            progress(done, total)
+
     perceptual = load_lpips("alex")
     measured = []
-    for view in views or sorted(store.spec().views):
-        trained_on = _trained_on(run_dir, view, episodes)
+    for view in views:
+        _refuse_leaks(run_dir, view, episodes)
         encoder = load_frame_encoder(run_dir, view)
         perceptual = perceptual.to(encoder.device)
-        mean = mean_frame(store, [episode for episode in trained_on if episode in entries], view)
-        measured.append(
-            _measure_view(store, encoder, perceptual, view, [entries[e] for e in sorted(episodes)], mean, progress)
-        )
+        mean = mean_frame(store, _training_entries(entries, run_dir, view), view)
+        measured.append(_measure_view(store, encoder, perceptual, view, chosen, mean, advance))
     return FidelityReport(tuple(measured), "alex")
 
 
@@ -221,10 +235,14 @@ def report_inputs(store: EpisodeStore, run_dir: Path, episodes: Sequence[str]) -
         "format": REPORT_FORMAT,
         "checkpoints": {view: checkpoint_digest(run_for_view(run_dir, view)) for view in views},
         "frames": {e: {view: entries[e].frames_sha256[view] for view in views} for e in sorted(episodes)},
+        "mean_frame_of": {
+            view: digest({e.id: e.frames_sha256[view] for e in _training_entries(entries, run_dir, view)})
+            for view in views
+        },
     }
 
 
-def mean_frame(store: EpisodeStore, episodes: Sequence[str], view: str) -> U8:
+def mean_frame(store: EpisodeStore, episodes: Sequence[EpisodeEntry], view: str) -> U8:
     """Mean over all frames of these episodes, rounded: uint8 [H,W,3]."""
     if not episodes:
         raise UsageError(
@@ -235,19 +253,28 @@ def mean_frame(store: EpisodeStore, episodes: Sequence[str], view: str) -> U8:
     total: npt.NDArray[np.int64] | None = None
     count = 0
     for episode in episodes:
-        frames = open_shard(store.frames_path(view, episode)).arrays["frames"]
+        frames = open_frames(store, episode, view)
         part = frames.sum(axis=0, dtype=np.int64)
         total, count = part if total is None else total + part, count + len(frames)
     assert total is not None
     return np.round(total / count).astype(np.uint8)
 
 
-def _trained_on(run_dir: Path, view: str, episodes: Sequence[str]) -> list[str]:
-    """The run's training episodes. SplitError where validation meets them."""
-    run = run_for_view(run_dir, view)
+def _training_entries(entries: Mapping[str, EpisodeEntry], run_dir: Path, view: str) -> list[EpisodeEntry]:
+    """The episodes that the view's run was trained on, as far as the dataset still has them."""
+    return [entries[episode] for episode in sorted(_trained_on(run_for_view(run_dir, view)) & entries.keys())]
+
+
+def _trained_on(run: Path) -> set[str]:
     state = read_state(run)
     assert state is not None  # run_for_view found its checkpoint
-    leaked = sorted(set(episodes) & state.train_episodes.keys())
+    return set(state.train_episodes)
+
+
+def _refuse_leaks(run_dir: Path, view: str, episodes: Sequence[str]) -> None:
+    """SplitError where validation meets the run's training episodes."""
+    run = run_for_view(run_dir, view)
+    leaked = sorted(set(episodes) & _trained_on(run))
     if leaked:
         raise SplitError(
             f"this VQGAN was trained on {len(leaked)} of the episodes to validate it on",
@@ -255,7 +282,6 @@ def _trained_on(run_dir: Path, view: str, episodes: Sequence[str]) -> list[str]:
             found=", ".join(leaked[:5]),
             remedy="train it again on today's split, or restore the split it was trained with",
         )
-    return sorted(state.train_episodes)
 
 
 def _measure_view(
@@ -265,7 +291,7 @@ def _measure_view(
     view: str,
     entries: Sequence[EpisodeEntry],
     mean: U8,
-    progress: Callable[[int], None] | None,
+    advance: Callable[[int], None],
 ) -> ViewFidelity:
     key, counts, precision = encoder.key, np.zeros(encoder.codes, np.int64), PrecisionCost()
     measured: list[EpisodeFidelity] = []
@@ -279,8 +305,7 @@ def _measure_view(
         measured.append(_measure_episode(entry.id, view, frames, decoded, mean, distance))
         precision += precision_cost(encoder, frames[::PRECISION_STRIDE], latents[::PRECISION_STRIDE])
         worst += _worst(entry.id, view, frames, decoded)
-        if progress is not None:
-            progress(len(frames))
+        advance(len(frames))
     worst.sort(key=lambda frame: -frame.mse)
     return ViewFidelity(view, key, tuple(measured), counts, precision, tuple(worst[:WORST_FRAMES]))
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vilp_data.episodes import EpisodeStore
+from vilp_data.episode_files import open_frames
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
-from vilp_data.shards import open_shard
 from vilp_data.types import U8, Bool
 from vilp_models.metrics import moving_mask, temporal_median
 
@@ -93,8 +93,7 @@ class TrainingFrames:
         return slice(row, row + self.crop), slice(column, column + self.crop)
 
 
-def open_clips(store: EpisodeStore, episodes: Sequence[str], views: Sequence[str]) -> list[Clip]:
-    """Map the frames of these episodes and views. Raises StoreError where a file is missing or damaged."""
-    return [
-        Clip(open_shard(store.frames_path(view, episode)).arrays["frames"]) for episode in episodes for view in views
-    ]
+def open_clips(store: EpisodeStore, episodes: Sequence[EpisodeEntry], views: Sequence[str]) -> list[Clip]:
+    """Map the frames of these episodes and views. Raises StoreError where a file is missing, or is of other frames than the
+    episode's (see `vilp_data.episode_files`)."""
+    return [Clip(open_frames(store, episode, view)) for episode in episodes for view in views]

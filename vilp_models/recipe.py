@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from vilp_data.errors import SpecError, nearest
+from vilp_data.errors import SpecError, UsageError, nearest
 from vilp_data.spec import Frozen
 
 Precision = Literal["f32", "bf16"]
@@ -34,7 +35,7 @@ class VqganRecipe(Frozen):
 
     Data and optimisation
     crop                side in pixels of the random square a frame is cut to in training, None for whole frames
-    crop_moving         share of crops that are centred on a moving pixel
+    crop_moving         share of crops that are centred on a moving pixel; without `crop` it has no effect
     schedule            "constant" after the warm-up, or "cosine" down to zero at the last step
     codebook_start      steps before quantisation begins; the codebook is then fitted to the encoder's outputs
     restart_every       every so many steps codes unused since the last time are moved onto encoder outputs; 0 is never
@@ -98,12 +99,61 @@ class VqganRecipe(Frozen):
         return 1 << (len(self.multipliers) - 1)
 
 
-def vqgan_recipe(models: dict[str, dict[str, Any]], *, where: str) -> VqganRecipe:
-    """The recipe in `models["vqgan"]` (`TaskSpec.models`), the paper's where the table is absent.
+# What small machines change: no discriminator (which needs far more steps), a narrower network for all views at once, crops
+# around what moves, and a learning rate for few steps.
+_SMALL: Mapping[str, Any] = {
+    "share_views": True,
+    "width": 16,
+    "blocks": 1,
+    "groups": 8,
+    "perceptual": "alex",
+    "moving_weight": 4.0,
+    "discriminator_weight": 0.0,
+    "crop_moving": 0.7,
+    "betas": (0.9, 0.99),
+    "schedule": "cosine",
+    "clip_norm": 1.0,
+}
 
-    Raises SpecError that names `where`, the key and the nearest known one.
+VQGAN_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "tiny": {  # seconds: every stage runs, nothing is learnt well
+        **_SMALL,
+        "multipliers": (1, 1, 2, 2),
+        "codes": 256,
+        "crop": 32,
+        "steps": 60,
+        "batch_size": 16,
+        "learning_rate": 3e-3,
+        "warmup_steps": 10,
+        "codebook_start": 20,
+        "restart_every": 20,
+    },
+    "cpu": {  # two cores, about twenty minutes
+        **_SMALL,
+        "multipliers": (1, 2, 4, 4),
+        "crop": 48,
+        "steps": 4000,
+        "batch_size": 32,
+        "learning_rate": 2e-3,
+        "warmup_steps": 50,
+        "codebook_start": 500,
+        "restart_every": 50,
+        "precision": "bf16",
+    },
+    "paper": {},
+}
+"""What each preset changes in the paper's recipe, for every task. A task's own [models.vqgan], its preset's table included,
+comes on top."""
+
+
+def vqgan_recipe(models: Mapping[str, Mapping[str, Any]], *, preset: str | None, where: str) -> VqganRecipe:
+    """The preset's recipe (the paper's for None) with the keys of `models["vqgan"]` (`TaskSpec.models`) on top.
+
+    Raises UsageError for an unknown preset, SpecError that names `where`, the key and the nearest known one.
     """
-    table = models.get("vqgan", {})
+    if preset is not None and preset not in VQGAN_PRESETS:
+        raise UsageError(f"unknown preset {preset!r}", where=where, remedy=nearest(preset, VQGAN_PRESETS))
+    table = {**VQGAN_PRESETS[preset or "paper"], **models.get("vqgan", {})}
     unknown = [key for key in table if key not in VqganRecipe.model_fields]
     if unknown:
         raise SpecError(

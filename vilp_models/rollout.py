@@ -3,6 +3,8 @@
 An environment for this is what `make_env` makes, and keeps to a small contract:
 
 - `reset(seed=..., options={"state": state})` restores a recorded state; the seed is the episode's tag `seed`, if any;
+- its constructor takes the task's `sim.options`, and `cameras=False` for a world that draws no images (replay needs none,
+  and drawing is slow); it is not told `cameras` where images are wanted, so that is its default;
 - observations are dicts that hold the views by name, as uint8 [H,W,3];
 - every info holds "state", float64 [S], laid out like the episode's;
 - its metadata may say `state_names`, `state_periods` (inf where a value does not wrap around), `controlled_state` (the
@@ -30,8 +32,8 @@ RENDER_MIN_DB = 40.0
 LISTED_STATES = 8
 """How many dimensions of the state a report prints; Hanoi has dozens."""
 
-Progress = Callable[[int], None]
-"""Told how many steps were done since it was last told."""
+Progress = Callable[[int, int], None]
+"""Told (steps done, steps in all)."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +84,24 @@ class RenderReport:
 
 
 def make_env(spec: TaskSpec, *, cameras: bool = True) -> Any:
-    """The task's simulator, with or without images in its observations. Raises UsageError where the task names none, or its packages are not installed."""
+    """The task's simulator, with or without images in its observations.
+
+    Raises UsageError where the task names none, its packages are not installed, or it does not take the options."""
     if spec.sim is None:
         raise UsageError("this task has no simulator", where=spec.name, remedy="give its TOML a [sim] table with `env`")
     register()
     import gymnasium
 
+    options = spec.sim.options if cameras else {**spec.sim.options, "cameras": False}
     try:
-        return gymnasium.make(spec.sim.env, **{**spec.sim.options, "cameras": cameras})
+        return gymnasium.make(spec.sim.env, **options)
+    except TypeError as error:
+        raise UsageError(
+            f"{spec.sim.env} cannot be made with these options",
+            where=spec.name,
+            found=f"{error} (options {', '.join(sorted(options))})",
+            remedy="its constructor must take the task's sim.options, and the keyword cameras, False where no images are wanted",
+        ) from error
     except ImportError as error:
         raise UsageError(f"{spec.sim.env} is not installed", found=str(error), remedy="make setup") from error
     except gymnasium.error.UnregisteredEnv as error:
@@ -106,7 +118,7 @@ def replay(episode: Episode, env: Any, *, progress: Progress | None = None) -> R
     """Play the episode's actions from its first state and compare every later state; then again one step off.
 
     Raises UsageError where the episode lacks actions or states, or has one that is not finite. `progress` counts the
-    steps of both plays: 2 (F - 1).
+    steps of both plays: 2 (F - 1) in all.
     """
     actions, states = _replayable(episode)
     n_steps = len(states) - 1
@@ -114,7 +126,8 @@ def replay(episode: Episode, env: Any, *, progress: Progress | None = None) -> R
     seed = int(episode.tags["seed"]) if "seed" in episode.tags else None
     errors = []
     for shift in (0, 1):
-        played = play(env, states[0], actions[shift : shift + n_steps], seed=seed, progress=progress)
+        told = None if progress is None else _behind(progress, before=shift * n_steps, total=2 * n_steps)
+        played = play(env, states[0], actions[shift : shift + n_steps], seed=seed, progress=told)
         errors.append(_compare(played, states[1:], periods))
     names = env.metadata.get("state_names", tuple(f"state[{i}]" for i in range(states.shape[1])))
     controlled = env.metadata.get("controlled_state", tuple(range(states.shape[1])))
@@ -128,9 +141,14 @@ def play(env: Any, state: F64, actions: F32, *, seed: int | None = None, progres
     for action in actions:
         _, _, _, _, info = env.step(action)
         played.append(info["state"])
-        if progress:
-            progress(1)
+        if progress is not None:
+            progress(len(played), len(actions))
     return np.stack(played).astype(np.float64)
+
+
+def _behind(progress: Progress, *, before: int, total: int) -> Progress:
+    """Progress of a part that follows `before` steps of `total`."""
+    return lambda done, _: progress(before + done, total)
 
 
 def _replayable(episode: Episode) -> tuple[F32, F64]:
@@ -178,14 +196,14 @@ def render_match(episode: Episode, env: Any, *, every: int = 1, progress: Progre
     seed = int(episode.tags["seed"]) if "seed" in episode.tags else None
     same: dict[str, list[float]] = {view: [] for view in episode.frames}
     following: dict[str, list[float]] = {view: [] for view in episode.frames}
-    for step in steps:
+    for done, step in enumerate(steps, start=1):
         observation, _ = env.reset(seed=seed, options={"state": episode.state[step]})
         for view, frames in episode.frames.items():
             drawn = _drawn(observation, view, frames.shape[1:])
             same[view].append(psnr(drawn, frames[episode.source_index[view][step]]))
             following[view].append(psnr(drawn, frames[episode.source_index[view][step + 1]]))
-        if progress:
-            progress(1)
+        if progress is not None:
+            progress(done, len(steps))
     return RenderReport(episode.id, tuple(steps), _frozen(same), _frozen(following))
 
 

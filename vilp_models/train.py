@@ -14,8 +14,9 @@ from typing import Any, Protocol
 import torch
 from tqdm import tqdm
 
-from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import UsageError, nearest
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
+from vilp_data.errors import BusyError, UsageError, nearest
+from vilp_data.shards import writer_lock
 from vilp_data.spec import TaskSpec
 from vilp_models.checkpoint import (
     FILE,
@@ -65,34 +66,63 @@ def train_vqgan(
 
     A finished run with this recipe is left alone; an unfinished one goes on exactly where it stopped. Returns where each
     run ended. Raises UsageError where a run in `run_dir` has another recipe, or an unfinished one other episodes
-    (`restart` begins those anew), DivergedError where a loss stops being finite, KeyboardInterrupt on Ctrl-C, saved.
+    (`restart` begins those anew), BusyError where another process trains into it, DivergedError where a loss stops being
+    finite, KeyboardInterrupt on Ctrl-C, saved.
     """
     store = EpisodeStore(dataset_dir)
-    keys = {entry.id: entry.key for entry in store.index()}
+    entries = {entry.id: entry for entry in store.index()}
     for episode in train_episodes:
-        if episode not in keys:
-            raise UsageError(f"no episode called {episode!r}", where=dataset_dir, remedy=nearest(episode, keys))
-    wanted = {episode: keys[episode] for episode in sorted(train_episodes)}
+        if episode not in entries:
+            raise UsageError(f"no episode called {episode!r}", where=dataset_dir, remedy=nearest(episode, entries))
+    episodes = [entries[episode] for episode in sorted(train_episodes)]
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     groups = [tuple(sorted(spec.views))] if recipe.share_views else [(view,) for view in sorted(spec.views)]
     states = []
     for views in groups:
-        run, label = run_folder(run_dir, views), f"VQGAN {'+'.join(views)}"
-        state = RunState(0, recipe.steps, views, split_hash, wanted)
-        if restart:
-            (run / FILE).unlink(missing_ok=True)
-        earlier = read_state(run)
-        if earlier is not None and not _must_train(run, recipe.model_dump(mode="json"), state, earlier):
-            states.append(earlier)
-            if show:
-                print(f"{label}: trained already, {earlier.steps} steps{_unseen(earlier, state)}")
-            continue
-        frames = TrainingFrames(
-            open_clips(store, list(wanted), views), crop=recipe.crop, crop_moving=recipe.crop_moving
-        )
-        trainee = VqganTraining(recipe, frames, device=device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        rate = Rate("images", recipe.batch_size)
-        states.append(fit(trainee, run, state, recipe.model_dump(mode="json"), label=label, rate=rate, show=show))
+        run = run_folder(run_dir, views)
+        wanted = RunState(0, recipe.steps, views, split_hash, {entry.id: entry.key for entry in episodes})
+        with _only_trainer(run):
+            if restart:
+                (run / FILE).unlink(missing_ok=True)
+            states.append(_train_run(store, episodes, recipe, run, wanted, device=device, show=show))
     return states
+
+
+def _train_run(
+    store: EpisodeStore,
+    episodes: Sequence[EpisodeEntry],
+    recipe: VqganRecipe,
+    run: Path,
+    wanted: RunState,
+    *,
+    device: str,
+    show: bool,
+) -> RunState:
+    """Bring one run to its end, or leave it alone where it is there."""
+    label, table = f"VQGAN {'+'.join(wanted.views)}", recipe.model_dump(mode="json")
+    earlier = read_state(run)
+    if earlier is not None and not _must_train(run, table, wanted, earlier):
+        if show:
+            print(f"{label}: trained already, {earlier.steps} steps{_unseen(earlier, wanted)}")
+        return earlier
+    clips = open_clips(store, episodes, wanted.views)
+    trainee = VqganTraining(
+        recipe, TrainingFrames(clips, crop=recipe.crop, crop_moving=recipe.crop_moving), device=device
+    )
+    return fit(trainee, run, wanted, table, label=label, rate=Rate("images", recipe.batch_size), show=show)
+
+
+@contextlib.contextmanager
+def _only_trainer(run: Path) -> Iterator[None]:
+    """Be the only process that trains into this run. Raises BusyError at once where another does."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(writer_lock(run))
+        except BusyError as error:
+            raise BusyError(
+                "another process is training this run", where=run, remedy="wait until it is done, or stop it"
+            ) from error
+        yield
 
 
 class Rate:

@@ -102,9 +102,25 @@ class VqganEncoder:
 
     @property
     def key_fields(self) -> dict[str, str]:
-        """All that decides the bytes of stored latents, and nothing else: decoder and codebook have no part in it."""
-        weights = encoder_digest(self.model)
-        return {"weights": weights, "scaling": str(LATENT_SCALING), "compute": self.precision, "storage": "f16"}
+        """All that decides the bytes of stored latents, and nothing else: decoder and codebook have no part in it.
+
+        The architecture is named beside the weights, since equal tensors compute other things in another one (groups)."""
+        config = self.model.config
+        return {
+            "weights": encoder_digest(self.model),
+            "channels": "-".join(map(str, config.block_out_channels)),
+            "blocks": str(config.layers_per_block),
+            "groups": str(config.norm_num_groups),
+            "scaling": str(LATENT_SCALING),
+            "compute": self.precision,
+            "storage": "f16",
+            "device": self.device.type,
+        }
+
+    @property
+    def parallel(self) -> bool:
+        """Processes do not share an accelerator: each would hold a copy of the network, and they would wait for each other."""
+        return self.device.type == "cpu"
 
     def latent_shape(self, height: int, width: int) -> tuple[int, int, int]:
         """(c, h, w) for frames of this size. Raises UsageError where the size does not divide."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.models.conftest import STEPS, tiny_recipe
-from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import SplitError
+from vilp_data.episodes import EpisodeStore, Origin
+from vilp_data.errors import SplitError, StoreError
 from vilp_data.latents import latents_path
 from vilp_data.shards import write_shard
 from vilp_data.spec import TaskSpec
@@ -66,7 +67,19 @@ def test_validating_on_training_episodes_is_refused(store: EpisodeStore, run_dir
 
 def test_the_mean_frame_is_the_mean_of_all_training_frames(store: EpisodeStore) -> None:
     frames = np.concatenate([store.read(e).frames["front"] for e in "ab"])
-    assert np.array_equal(mean_frame(store, ["a", "b"], "front"), np.round(frames.mean(axis=0)).astype(np.uint8))
+    assert np.array_equal(mean_frame(store, store.index()[:2], "front"), np.round(frames.mean(axis=0)).astype(np.uint8))
+
+
+def test_progress_counts_the_frames_of_every_view_up_to_all(store: EpisodeStore, run_dir: Path) -> None:
+    told: list[tuple[int, int]] = []
+    fidelity_report(store, run_dir, ["c", "d"], progress=lambda done, total: told.append((done, total)))
+    assert told == [(n * STEPS, 4 * STEPS) for n in (1, 2, 3, 4)]
+
+
+def test_a_foreign_frames_file_is_not_averaged(store: EpisodeStore) -> None:
+    store.frames_path("front", "a").write_bytes(store.frames_path("side", "a").read_bytes())
+    with pytest.raises(StoreError, match="not the frames this episode was committed with"):
+        mean_frame(store, store.index()[:2], "front")
 
 
 def test_errors_add_up_to_those_of_everything_at_once() -> None:
@@ -113,3 +126,15 @@ def test_a_report_is_fresh_until_a_checkpoint_or_the_episodes_change(
     recipe = tiny_recipe(share_views=True, seed=1)
     train_vqgan(store.root, spec, recipe, run_dir, train_episodes=["a"], split_hash="s", restart=True, show=False)
     assert read_fresh_report(folder, report_inputs(store, run_dir, ["c", "d"])) is None
+
+
+def test_a_report_is_not_fresh_where_training_frames_behind_its_baseline_changed(
+    store: EpisodeStore, run_dir: Path
+) -> None:
+    before = report_inputs(store, run_dir, ["c", "d"])
+    a = store.read("a")
+    brighter = {view: frames // 2 + 100 for view, frames in a.frames.items()}
+    store.write(dataclasses.replace(a, frames=brighter), Origin("a.mcap", "0" * 64, "0", "key-a", {}))
+    after = report_inputs(store, run_dir, ["c", "d"])
+    assert after["mean_frame_of"] != before["mean_frame_of"]
+    assert {**after, "mean_frame_of": None} == {**before, "mean_frame_of": None}

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vilp_data.plots import frame_psnr
 from vilp_models.metrics import MAX_PSNR_DB, moving_mask, psnr, temporal_median
 
 
@@ -19,6 +20,13 @@ def test_psnr_of_a_constant_offset_is_its_formula_both_ways(a: int, b: int) -> N
     expected = MAX_PSNR_DB if a == b else 20 * math.log10(255 / abs(a - b))
     assert psnr(_grey(a), _grey(b)) == pytest.approx(expected, abs=1e-3)
     assert psnr(_grey(b), _grey(a)) == pytest.approx(expected, abs=1e-3)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_psnr_of_a_frame_is_what_the_viewer_plots_for_it(seed: int) -> None:
+    real, other = (np.random.default_rng([seed, i]).integers(0, 256, (2, 4, 6, 3), np.uint8) for i in range(2))
+    plotted = frame_psnr(real, other)
+    assert [psnr(a, b) for a, b in zip(real, other, strict=True)] == pytest.approx(plotted.tolist(), abs=1e-3)
 
 
 def test_psnr_over_a_mask_ignores_everything_else() -> None:

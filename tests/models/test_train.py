@@ -10,10 +10,10 @@ import pytest
 
 from tests.models.conftest import HEIGHT, WIDTH, tiny_recipe
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import StoreError, UsageError
-from vilp_data.shards import open_shard, write_shard
+from vilp_data.errors import BusyError, StoreError, UsageError
+from vilp_data.shards import open_shard, write_shard, writer_lock
 from vilp_data.spec import TaskSpec
-from vilp_models.checkpoint import FILE, load_checkpoint, read_state, run_folder
+from vilp_models.checkpoint import FILE, load_checkpoint, model_tensors, read_state, run_folder
 from vilp_models.recipe import VqganRecipe
 from vilp_models.train import train_vqgan
 from vilp_models.vqgan import load_frame_encoder
@@ -122,6 +122,34 @@ def test_another_recipe_or_lost_episodes_are_refused_unless_restarted(
         _train(store, spec, tiny_recipe(), run_dir, "ab")
     _train(store, spec, tiny_recipe(), run_dir, "ab", restart=True)
     assert load_frame_encoder(run_dir, "front").trained_on == {"key-a", "key-b"}
+
+
+def test_a_run_that_another_process_trains_is_busy(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    with writer_lock(run_folder(run_dir, ("front",))), pytest.raises(BusyError, match="training this run"):
+        _train(store, spec, tiny_recipe(), run_dir)
+    assert read_state(run_folder(run_dir, ("front",))) is None
+    _train(store, spec, tiny_recipe(), run_dir)
+    assert (read_state(run_folder(run_dir, ("front",))) or pytest.fail("not trained")).finished
+
+
+def test_a_foreign_frames_file_is_not_trained_on(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    store.frames_path("front", "a").write_bytes(store.frames_path("front", "b").read_bytes())
+    with pytest.raises(StoreError, match=r"not the frames(.|\n)*vilp-data ingest"):
+        _train(store, spec, tiny_recipe(), run_dir)
+
+
+def test_the_networks_tensors_are_read_without_what_resuming_needs(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path
+) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    run = run_folder(run_dir, ("front",))
+    model, whole = model_tensors(run), load_checkpoint(run)
+    assert whole.trainer
+    assert model.keys() == whole.model.keys()
+    for name, array in model.items():
+        np.testing.assert_array_equal(array, whole.model[name])
+        assert array.flags.owndata
+        assert array.flags.writeable
 
 
 def test_an_unknown_episode_is_named(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:

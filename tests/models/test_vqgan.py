@@ -100,6 +100,25 @@ def test_the_key_changes_with_the_arithmetic() -> None:
     assert VqganEncoder(model, precision="f32").key != VqganEncoder(model, precision="bf16").key
 
 
+def test_the_key_changes_with_groups_that_leave_every_tensor_as_it_is() -> None:
+    few, many = (build_vqgan(tiny_recipe(groups=groups)) for groups in (4, 8))
+    many.load_state_dict(few.state_dict())
+    frames = card_frames().batch(seed=0, step=0, size=1)[0]
+    encoders = VqganEncoder(few), VqganEncoder(many)
+    assert not np.array_equal(encoders[0].encode(frames), encoders[1].encode(frames))
+    assert encoders[0].key != encoders[1].key
+    assert encoders[0].key_fields["weights"] == encoders[1].key_fields["weights"]
+
+
+def test_the_key_names_the_kind_of_device_and_accelerators_are_not_shared() -> None:
+    encoder = VqganEncoder(build_vqgan(tiny_recipe()))
+    assert (encoder.key_fields["device"], encoder.parallel) == ("cpu", True)
+    key = encoder.key
+    encoder.device = torch.device("cuda", 0)  # no tensor moves: the key asks for the device's kind alone
+    assert (encoder.key_fields["device"], encoder.parallel) == ("cuda", False)
+    assert encoder.key != key
+
+
 def test_nearest_codes_are_nearest() -> None:
     codebook = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
     z = torch.tensor([[0.9, 0.1, 0.0], [0.1, 0.9, 0.8]]).T.view(1, 3, 1, 2)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
@@ -19,7 +20,7 @@ from tests.real_data import real_data
 from tests.synthetic import ACTION_TOPIC, HEADER_LAG_NS, JOINT_TOPIC, START_NS, STORE, Encoding, image_topic, write_mcap
 from vilp_data.decode import decode_vector
 from vilp_data.errors import LogError
-from vilp_data.sources import open_log
+from vilp_data.sources import MessageError, open_log
 from vilp_data.types import Message
 
 ENCODINGS: tuple[Encoding, ...] = ("cdr", "protobuf", "json")
@@ -262,11 +263,69 @@ def test_fewer_messages_than_the_statistics_count_are_an_error(tmp_path: Path) -
         read(path)
 
 
-def test_bytes_that_do_not_fit_their_schema_name_topic_and_time(tmp_path: Path) -> None:
-    def broken(writer: Writer) -> None:
-        writer.add_message(writer.register_channel("/bad", "json", 0), 77, b"{not json", 77)
+def with_statistics_from(path: Path, start_ns: int) -> Path:
+    """The log with statistics that begin at another time, as rosbag2's rewriter leaves them."""
+    content = path.read_bytes()
+    place = content.rindex(
+        struct.pack("<BQ", Opcode.STATISTICS, 56)
+    )  # its length with one channel; times come at its 26th byte
+    begin = place + 9 + 26
+    path.write_bytes(content[:begin] + struct.pack("<Q", start_ns) + content[begin + 8 :])
+    return path
 
-    path = write_json(tmp_path / "run.mcap", [1], before=broken)
+
+def test_statistics_that_begin_after_the_first_message_cut_nothing_off(tmp_path: Path) -> None:
+    path = with_statistics_from(write_json(tmp_path / "run.mcap", [0, 10, 20], chunk_size=60, enable_crcs=False), 10)
+    with open_log(path) as log:
+        (episode,) = log.episodes()
+        assert (episode.start_ns, episode.end_ns) == (0, 21)
+        whole = list(log.messages(["/t"], start_ns=episode.start_ns, end_ns=episode.end_ns))
+    assert [m.log_time_ns for m in whole] == [0, 10, 20]
+
+
+def test_real_log_whose_statistics_begin_late_is_read_whole() -> None:
+    path = real_data("logs/rosbag2_tests/rosbag2_py/test/resources/mcap/convert_a/rewriter_a_0.mcap")
+    with open_log(path) as log:
+        (episode,) = log.episodes()
+        topics = log.topics()
+        messages = list(log.messages([t.name for t in topics], start_ns=episode.start_ns, end_ns=episode.end_ns))
+    assert episode.start_ns == 0
+    assert len(messages) == sum(t.message_count or 0 for t in topics)
+
+
+def test_two_channels_on_one_topic_are_told_together(tmp_path: Path) -> None:
+    """`mcap merge` keeps a channel for each file."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "test")
+        channels = [writer.register_channel("/t", "json", 0) for _ in range(2)]
+        for time in range(10):
+            writer.add_message(channels[time % 2], time, b"{}", time)
+        writer.finish()
+    with open_log(path) as log:
+        times, complete = log.message_times()
+        assert log.topics()[0].message_count == 10
+    assert times["/t"].tolist() == list(range(10))
+    assert complete
+
+
+def test_after_a_message_that_does_not_fit_its_schema_the_next_one_can_be_had(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [1, 3], before=lambda w: bad_message(w, 2))
+    with open_log(path) as log:
+        messages = log.messages(["/t", "/bad"])
+        assert next(messages).log_time_ns == 1
+        with pytest.raises(MessageError, match="does not fit"):
+            next(messages)
+        assert next(messages).log_time_ns == 3
+
+
+def bad_message(writer: Writer, time: int) -> None:
+    writer.add_message(writer.register_channel("/bad", "json", 0), time, b"{not json", time)
+
+
+def test_bytes_that_do_not_fit_their_schema_name_topic_and_time(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [1], before=lambda w: bad_message(w, 77))
     assert len(read(path, ["/t"])) == 1
     with pytest.raises(LogError, match="a message of /bad at 77 ns does not fit its schema"):
         read(path, ["/bad"])

@@ -52,6 +52,36 @@ def test_a_folder_that_is_no_zarr_store_shows_what_is_inside(tmp_path: Path) -> 
         open_log(tmp_path / "logs")
 
 
+def rosbag2_folder(folder: Path, n_files: int) -> Path:
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    for number in range(n_files):
+        write_mcap(folder / f"{folder.name}_{number}.mcap", n_frames=2)
+    return folder
+
+
+def test_a_rosbag2_folder_stands_for_the_file_in_it(tmp_path: Path) -> None:
+    folder = rosbag2_folder(tmp_path / "take", 1)
+    with open_log(folder) as by_folder, open_log(folder / "take_0.mcap") as by_file:
+        assert by_folder.path == by_file.path
+        assert by_folder.sha256() == by_file.sha256()
+        assert by_folder.episodes() == by_file.episodes()
+
+
+def test_a_split_bag_is_refused_by_the_names_of_its_files(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"take_0\.mcap, take_1\.mcap(.|\n)*not joined yet"):
+        open_log(rosbag2_folder(tmp_path / "take", 2))
+
+
+def test_real_rosbag2_folders_are_opened_or_say_that_they_are_split() -> None:
+    with open_log(real_data("logs/rosbag2_tests/rosbag2_py/test/resources/mcap/talker")) as log:
+        assert log.path.name == "talker.mcap"
+    with pytest.raises(LogError, match="split into several files"):
+        open_log(real_data("logs/rosbag2_tests/rosbag2_py/test/resources/mcap/wbag"))
+    with pytest.raises(LogError, match=r"talker\.db3"):
+        open_log(real_data("logs/rosbag2_tests/rosbag2_py/test/resources/sqlite3/talker"))
+
+
 def test_real_file_mangled_by_line_ending_conversion_is_recognised() -> None:
     with pytest.raises(LogError, match="binary"):
         open_log(real_data("logs/keelson/connectors_klog_bin_2024-05-15.mcap"))

@@ -10,8 +10,11 @@ from typing import Protocol
 from vilp_data.errors import LogError, UsageError
 from vilp_data.sources.mcap_log import McapLog
 from vilp_data.sources.mcap_records import MAGIC as MCAP_MAGIC
+from vilp_data.sources.message_decoders import MessageError
 from vilp_data.sources.zarr_log import ZarrLog
 from vilp_data.types import I64, LogReader, Message
+
+__all__ = ["FORMATS", "IndexedLog", "LogFormat", "MessageError", "open_log"]
 
 HEAD_SIZE = 16  # bytes that tell every format here apart
 
@@ -50,10 +53,13 @@ FORMATS = (
 def open_log(path: Path, *, array_rate_hz: float = 10.0) -> IndexedLog:
     """A reader for the log at `path`, its format told by content, not by suffix. Use it as a context manager.
 
+    A rosbag2 folder (metadata.yaml beside one .mcap file) stands for the file in it. Split bags are not joined: a LogError.
     `array_rate_hz` is the rate of rows in logs that carry no time (zarr). UsageError where nothing is there; LogError where it
     is empty, not a log, a log of a format that is not read, or cut off."""
     if not path.exists():
         raise UsageError("no such log", where=path, remedy="check the path")
+    if path.is_dir():
+        path = _file_of_bag(path) or path
     head = _head(path)
     for log_format in FORMATS:
         if log_format.matches(path, head):
@@ -63,6 +69,18 @@ def open_log(path: Path, *, array_rate_hz: float = 10.0) -> IndexedLog:
                 )
             return log_format.open(path, array_rate_hz)
     raise _not_a_log(path, head)
+
+
+def _file_of_bag(folder: Path) -> Path | None:
+    """The one MCAP file of a rosbag2 folder, None where the folder is none; LogError where it holds several."""
+    if not (folder / "metadata.yaml").is_file():
+        return None
+    files = sorted(folder.glob("*.mcap"))
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
+        remedy = "split bags are not joined yet: name one file, or join them with `mcap merge`"
+        raise LogError("the bag is split into several files", where=folder, found=names, remedy=remedy)
+    return files[0] if files else None
 
 
 def _is_zarr(path: Path) -> bool:

@@ -103,17 +103,30 @@ def _from_summary(reader: RecordReader, start: int, footer_start: int, crc: int)
     statistics = index.statistics
     if statistics is None:
         index.counts = _counts_by_message_index(index, reader)
-        spans = [(chunk.message_start_time, chunk.message_end_time) for chunk in index.chunks]
-        index.first_ns, index.last_ns = min(first for first, _ in spans), max(last for _, last in spans)
         for message in index.loose:
             index.count(message.channel_id, message.log_time_ns)
-    elif statistics.message_count:
-        index.first_ns, index.last_ns = statistics.message_start_time, statistics.message_end_time
-        if sum(statistics.channel_message_counts.values()) == statistics.message_count:
-            index.counts = Counter(statistics.channel_message_counts)
-    else:
+    elif not statistics.message_count:
         index.counts = Counter()
+    elif sum(statistics.channel_message_counts.values()) == statistics.message_count:
+        index.counts = Counter(statistics.channel_message_counts)
+    index.first_ns, index.last_ns = _span(index)
     return index
+
+
+def _span(index: McapIndex) -> tuple[int | None, int | None]:
+    """Log times of the first and the last message, as wide as anything in the summary tells: rosbag2's rewriter leaves statistics
+    that begin after its first chunk does."""
+    statistics = index.statistics
+    spans = [(message.log_time_ns, message.log_time_ns) for message in index.loose]
+    # A chunk without messages claims a time of zero.
+    spans += [
+        (chunk.message_start_time, chunk.message_end_time)
+        for chunk in index.chunks
+        if chunk.message_index_offsets or chunk.message_end_time
+    ]
+    if statistics is not None and statistics.message_count:
+        spans.append((statistics.message_start_time, statistics.message_end_time))
+    return min((first for first, _ in spans), default=None), max((last for _, last in spans), default=None)
 
 
 def _describes_channels(index: McapIndex) -> bool:

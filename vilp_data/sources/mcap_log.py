@@ -9,11 +9,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
+import numpy as np
 from mcap.records import ChunkIndex
 
 from vilp_data.errors import LogError, nearest
 from vilp_data.sources.mcap_file import McapFile, RawMessage
-from vilp_data.sources.message_decoders import MALFORMED, Decoder, decoder_for
+from vilp_data.sources.message_decoders import MALFORMED, Decoder, MessageError, decoder_for
 from vilp_data.types import EPISODE_RECORD, I64, LogEpisode, Message, TopicInfo
 
 END_OF_TIME_NS = 1 << 64  # past every MCAP time stamp
@@ -73,19 +74,26 @@ class McapLog:
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
+        """As `LogReader.messages`. After a MessageError the iterator can be asked for the next message."""
         channel_ids = self._channels_of(topics)
         start = 0 if start_ns is None else start_ns
         end = END_OF_TIME_NS if end_ns is None else end_ns
         for channel_id in channel_ids:
             self._opened(channel_id)  # an unreadable topic is refused before the first message of any
-        return (self._decoded(raw) for raw in self._file.messages(channel_ids, start, end))
+        # `map` goes on after an error of `_decoded`, which a generator would not.
+        return map(self._decoded, self._file.messages(channel_ids, start, end))
 
     def message_times(self) -> tuple[dict[str, I64], bool]:
-        """Topic -> log times [n] in file order, from the message indexes; and whether they are all (else the first part)."""
-        by_channel = self._file.message_times(INDEXED_CHUNKS)
+        """Topic -> log times [n] in file order, from the message indexes; and whether they are all (else the first part).
+
+        Of a topic with several channels, as merging logs leaves them, the times are sorted: their order in the file is not told."""
         channels = self._file.index.channels
+        parts: dict[str, list[I64]] = {}
+        for channel_id, values in self._file.message_times(INDEXED_CHUNKS).items():
+            if channel_id in channels:
+                parts.setdefault(channels[channel_id].topic, []).append(values)
         times = {
-            channels[channel_id].topic: values for channel_id, values in by_channel.items() if channel_id in channels
+            topic: found[0] if len(found) == 1 else np.sort(np.concatenate(found)) for topic, found in parts.items()
         }
         return times, len(self._file.index.chunks) <= INDEXED_CHUNKS
 
@@ -144,9 +152,9 @@ class McapLog:
         try:
             body = channel.decode(raw.data)
         except MALFORMED as error:
-            raise LogError(
+            raise MessageError(
                 f"a message of {channel.topic} at {raw.log_time_ns} ns does not fit its schema",
-                where=self.path,
+                where=f"{self.path}, topic {channel.topic}",
                 found=f"{channel.encoding} {channel.schema or '(no schema)'}, {len(raw.data)} bytes: {error}",
                 remedy="leave the topic out of the task, or record it with a matching schema",
             ) from error

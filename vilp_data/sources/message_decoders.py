@@ -32,6 +32,11 @@ MALFORMED = (
     AssertionError,
 )
 
+
+class MessageError(LogError):
+    """One message whose bytes do not fit their schema, in a log that is whole. `where` names the log and the topic."""
+
+
 READABLE = "CDR with ros2msg or ros2idl schemas, protobuf, JSON"
 
 

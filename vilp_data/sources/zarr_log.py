@@ -28,7 +28,10 @@ BROKEN = (BaseZarrError, KeyError, ValueError, RuntimeError, TypeError, OSError)
 
 
 class ZarrLog:
-    """A `LogReader` over one zarr store. `array_rate_hz` is the rate its rows were recorded at."""
+    """A `LogReader` over one zarr store.
+
+    The store does not tell the rate its rows were recorded at: `array_rate_hz` is taken for it, and callers pass their task's rate.
+    So every row is one step whatever rate the task asks for; a wrong one resamples nothing, it only says the wrong times."""
 
     format = "zarr"
 
@@ -52,6 +55,25 @@ class ZarrLog:
                         digest.update(block)
         return digest.hexdigest()
 
+    def demonstration_sha256(self, name: str) -> str:
+        """SHA-256 of one demonstration: where its rows begin, and their values in every array under data/, whatever the chunks and
+        compression. So a store that grows leaves it as it is. Rows that cannot be read count as such; reading them will say why.
+        """
+        first, stop = self._row_ranges()[name]
+        digest = hashlib.sha256()
+        for topic in sorted(self._arrays):
+            array = self._arrays[topic]
+            digest.update(f"{topic} {array.dtype.str} {array.shape[1:]} {first}:{stop};".encode())
+            size = array.chunks[0]
+            for number in range(first // size, -(-stop // size)):
+                try:
+                    rows = self._chunk(topic, number)[max(first - number * size, 0) : stop - number * size]
+                except LogError:
+                    digest.update(b"unreadable")
+                else:
+                    digest.update(_bytes_of(rows))
+        return digest.hexdigest()
+
     def topics(self) -> list[TopicInfo]:
         return [TopicInfo(name, "array", "array", self.n_rows) for name in sorted(self._arrays)]
 
@@ -63,12 +85,16 @@ class ZarrLog:
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def episodes(self) -> list[LogEpisode]:
-        digits = max(3, len(str(len(self._ends) - 1)))
-        starts = [0, *self._ends[:-1].tolist()]
         return [
-            LogEpisode(f"episode_{number:0{digits}d}", self._time_ns(start), self._time_ns(end))
-            for number, (start, end) in enumerate(zip(starts, self._ends.tolist(), strict=True))
+            LogEpisode(name, self._time_ns(start), self._time_ns(end))
+            for name, (start, end) in self._row_ranges().items()
         ]
+
+    def _row_ranges(self) -> dict[str, tuple[int, int]]:
+        """Name of each demonstration -> its first row, and the row after its last."""
+        digits = max(3, len(str(len(self._ends) - 1)))
+        starts, ends = [0, *self._ends[:-1].tolist()], self._ends.tolist()
+        return {f"episode_{n:0{digits}d}": span for n, span in enumerate(zip(starts, ends, strict=True))}
 
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
@@ -146,6 +172,13 @@ class ZarrLog:
         while row < self.n_rows and self._time_ns(row) < time_ns:
             row += 1
         return row
+
+
+def _bytes_of(rows: npt.NDArray[Any]) -> bytes | memoryview:
+    """What an array holds, to be hashed; without a copy where its rows lie together."""
+    if rows.dtype.hasobject:
+        return repr(rows.tolist()).encode()
+    return np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
 
 
 def _open_store(path: Path) -> tuple[dict[str, Any], I64]:

@@ -1,0 +1,55 @@
+"""The members of a message's body, whatever its kind: an object with attributes (CDR, protobuf), a dict (JSON), an array. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from vilp_data.errors import DecodeError
+from vilp_data.types import Message
+
+
+def member(value: Any, name: str, default: Any = None) -> Any:
+    """A member by name, `default` where there is none."""
+    return value.get(name, default) if isinstance(value, dict) else getattr(value, name, default)
+
+
+def require_member(value: Any, name: str) -> Any:
+    """A member by name; of a list of messages (foxglove.JointStates), that member of each. AttributeError or KeyError if absent."""
+    if isinstance(value, dict):
+        return value[name]
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [require_member(item, name) for item in value]
+    return getattr(value, name)
+
+
+def first_member(value: Any, names: Iterable[str]) -> Any:
+    """The first of these members that is there, None where none is."""
+    return next((found for name in names if (found := member(value, name)) is not None), None)
+
+
+def member_names(value: Any) -> list[str]:
+    """The names of a message's members in the schema's order, set or not; none for numbers, text, lists and arrays."""
+    if isinstance(value, dict):
+        return [str(key) for key in value]
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    if descriptor is not None:
+        return [field.name for field in descriptor.fields]
+    return [name for name in getattr(value, "__dataclass_fields__", {}) if not name.startswith("__")]
+
+
+def set_members(value: Any) -> Iterator[tuple[str, Any]]:
+    """(name, value) of a message's members, those left out that a protobuf message has no value for."""
+    for name in member_names(value):
+        if not _is_unset(value, name):
+            yield name, member(value, name)
+
+
+def _is_unset(value: Any, name: str) -> bool:
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    return descriptor is not None and descriptor.fields_by_name[name].has_presence and not value.HasField(name)
+
+
+def cannot_decode(message: Message, what: str, found: str | None, remedy: str) -> DecodeError:
+    """The error for a message that cannot become what was asked for; it names the topic and the time."""
+    return DecodeError(what, where=f"{message.topic} at {message.log_time_ns} ns", found=found, remedy=remedy)

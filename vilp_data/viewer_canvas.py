@@ -1,0 +1,228 @@
+"""A drawing on disk: images, plots and their layout written into a Rerun recording (.rrd)."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from vilp_data.decode import decode_image, encoded_image
+from vilp_data.errors import StoreError, UsageError
+from vilp_data.plots import Plot
+from vilp_data.types import I64, U8, Message
+
+APPLICATION = "vilp"
+TIMELINE = "log_time"
+FLUSH_BYTES = 8 << 20  # image bytes held back before they go to the file
+END_MARK = b"RRF2FOOT"
+END_SIZE = 12  # the mark and four bytes more
+MAX_LEGEND = 9  # a longer legend would cover its plot
+MAX_PANELS = 4  # plots side by side; the rest are tabs of the last
+MAX_TABS = 8
+LINE_WIDTH = 1.5
+COLOURS = np.array(
+    [
+        *([255, 107, 107], [79, 195, 108], [91, 157, 255], [255, 200, 87], [197, 139, 255]),
+        *([77, 216, 216], [255, 159, 90], [245, 143, 198], [181, 192, 106], [191, 199, 213]),
+    ],
+    np.uint8,
+)
+
+Moment = dict[str, np.datetime64 | np.timedelta64]
+
+
+class Picture(NamedTuple):
+    """A panel that shows the images at an entity."""
+
+    entity: str
+    title: str
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A drawing on disk. `middle` is the moment that a picture shows; `notes` say what was left out or chosen."""
+
+    rrd: Path
+    recording_id: str
+    middle: Moment
+    notes: tuple[str, ...] = ()
+
+
+class Canvas:
+    """An .rrd file being written. Times are nanoseconds; images are RGB, top row first."""
+
+    def __init__(self, path: Path, *, wall_clock: bool) -> None:
+        self.id = uuid.uuid4().hex
+        self._path = path
+        self._recording = rr.RecordingStream(APPLICATION, recording_id=self.id, send_properties=False)
+        try:
+            self._recording.save(str(path))
+        except RuntimeError as error:
+            raise _unwritable(path, error) from error
+        self._wall_clock = wall_clock
+        self._held: dict[str, list[tuple[int, bytes, str]]] = {}
+        self._held_bytes = 0
+
+    def moment(self, time_ns: int) -> Moment:
+        """How Rerun's calls are told a time: a date on a wall clock, else a duration since zero."""
+        if self._wall_clock:
+            return {"timestamp": np.datetime64(time_ns, "ns")}
+        return {"duration": np.timedelta64(time_ns, "ns")}
+
+    def message_image(self, message: Message) -> None:
+        """One image message: its own bytes where a viewer can read those, else its pixels."""
+        encoded, entity = encoded_image(message), entity_of(message.topic)
+        if encoded is None:
+            self.frames(entity, decode_image(message)[None], np.array([message.log_time_ns]))
+            return
+        self._held.setdefault(entity, []).append((message.log_time_ns, *encoded))
+        self._held_bytes += len(encoded[0])
+        if self._held_bytes > FLUSH_BYTES:
+            self._send_held()
+
+    def frames(self, entity: str, frames: U8, times_ns: I64) -> None:
+        """uint8 [n,H,W,3] at int64 [n]."""
+        _, height, width, _ = frames.shape
+        form = rr.components.ImageFormat(height=height, width=width, color_model="RGB", channel_datatype="U8")
+        self._recording.log(entity, rr.Image.from_fields(format=form), static=True)
+        columns = rr.Image.columns(buffer=frames.reshape(len(frames), -1))
+        self._recording.send_columns(entity, indexes=[self._index(times_ns)], columns=columns)
+
+    def plots(self, plots: Iterator[Plot]) -> None:
+        for plot in plots:
+            colours = COLOURS[np.arange(len(plot.names)) % len(COLOURS)]
+            lines = rr.SeriesLines(names=plot.names, colors=colours, widths=LINE_WIDTH)
+            self._recording.log(plot.entity, lines, static=True)
+            times = self._index(np.array(plot.times_ns, np.int64))
+            columns = rr.Scalars.columns(scalars=plot.table())
+            self._recording.send_columns(plot.entity, indexes=[times], columns=columns)
+
+    def layout(self, pictures: Sequence[Sequence[Picture]], panels: Sequence[list[Plot]]) -> None:
+        """Rows of pictures over one row of plots, a panel's plots behind tabs; nothing else takes room."""
+        last = [plot for panel in panels[MAX_PANELS - 1 :] for plot in panel]
+        shown = [*panels[: MAX_PANELS - 1], *([last] if last else [])]
+        axis = self._whole_time([time_ns for panel in panels for plot in panel for time_ns in plot.times_ns])
+        columns = [_panel(panel, axis) for panel in shown]
+        rows = [rrb.Horizontal(*(rrb.Spatial2DView(origin=p.entity, name=p.title) for p in row)) for row in pictures]
+        rows += [rrb.Horizontal(*columns)] if columns else []
+        shares = [3.0] * len(pictures) + [2.0 if len(pictures) == 1 else 3.0] * (len(rows) - len(pictures))
+        blueprint = rrb.Blueprint(
+            rrb.Vertical(*rows, row_shares=shares),
+            rrb.TopPanel(state="collapsed"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+            auto_views=False,
+            auto_layout=False,
+        )
+        self._recording.send_blueprint(blueprint)
+
+    def close(self) -> None:
+        """Write what is left. Raises StoreError where the file is not whole afterwards: no room, or no permission."""
+        self._send_held()
+        try:
+            self._recording.flush()
+        except RuntimeError as error:
+            raise _unwritable(self._path, error) from error
+        finally:
+            self._recording.disconnect()
+        # What is written while disconnecting fails in silence: only the end mark shows that it did not.
+        if not _has_end(self._path):
+            raise _unwritable(self._path, "it lacks its end")
+
+    def abandon(self) -> None:
+        """Let go of a file that nobody wants any more."""
+        self._held.clear()
+        self._recording.disconnect()
+
+    def _send_held(self) -> None:
+        for entity, images in self._held.items():
+            times = self._index(np.array([image[0] for image in images], np.int64))
+            columns = rr.EncodedImage.columns(blob=[i[1] for i in images], media_type=[i[2] for i in images])
+            self._recording.send_columns(entity, indexes=[times], columns=columns)
+        self._held.clear()
+        self._held_bytes = 0
+
+    def _whole_time(self, times_ns: list[int]) -> rrb.TimeAxis | None:
+        """A time axis over all that was drawn, the same for all plots."""
+        if not times_ns:
+            return None
+        ends = [rrb.TimeRangeBoundary.absolute(nanos=time_ns) for time_ns in (min(times_ns), max(times_ns))]
+        return rrb.TimeAxis(view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
+
+    def _index(self, times_ns: npt.NDArray[Any]) -> rr.TimeColumn:
+        if self._wall_clock:
+            return rr.TimeColumn(TIMELINE, timestamp=times_ns.astype("datetime64[ns]"))
+        return rr.TimeColumn(TIMELINE, duration=times_ns.astype("timedelta64[ns]"))
+
+
+@contextmanager
+def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
+    """A canvas whose file appears under its name only once it is whole; on any error nothing is left behind.
+
+    Raises UsageError where its folder is missing, StoreError where the file cannot be written."""
+    if not rrd.parent.is_dir():
+        raise UsageError("no such folder", where=rrd.parent, remedy="make it, or save somewhere else")
+    if rrd.is_dir():
+        raise StoreError("a folder is in the way", where=rrd, remedy="save under another name")
+    temporary = rrd.with_name(f".{rrd.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        canvas = Canvas(temporary, wall_clock=wall_clock)
+        try:
+            yield canvas
+        except BaseException:
+            canvas.abandon()
+            raise
+        try:
+            canvas.close()
+            temporary.replace(rrd)
+        except OSError as error:
+            raise _unwritable(rrd, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _has_end(rrd: Path) -> bool:
+    with rrd.open("rb") as stream:
+        stream.seek(max(stream.seek(0, os.SEEK_END) - END_SIZE, 0))
+        return stream.read().startswith(END_MARK)
+
+
+def _unwritable(path: Path, found: object) -> StoreError:
+    remedy = "free some space, or save where you may write"
+    return StoreError("the drawing cannot be written", where=path.parent, found=found, remedy=remedy)
+
+
+def entity_of(topic: str, group: str = "") -> str:
+    """The place in the recording of a topic, or of one group of its numbers."""
+    parts = [part for part in topic.split("/") if part] + [part for part in group.split(".") if part]
+    return str(rr.new_entity_path(parts))
+
+
+def title_of(topic: str, group: str = "") -> str:
+    """Short, and enough to tell panels apart: the topic, and the last word of the group."""
+    last = group.rpartition(".")[2]
+    return f"{topic.strip('/')} {last}".strip()
+
+
+def _panel(plots: Sequence[Plot], axis: rrb.TimeAxis | None) -> Any:
+    views = [
+        rrb.TimeSeriesView(
+            origin=plot.entity,
+            contents=f"{plot.entity}",
+            name=plot.title,
+            axis_x=axis,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=1 < len(plot.names) <= MAX_LEGEND),
+        )
+        for plot in plots[:MAX_TABS]
+    ]
+    return views[0] if len(views) == 1 else rrb.Tabs(*views)
