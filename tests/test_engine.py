@@ -24,8 +24,14 @@ def square(number: int) -> int:
 
 
 def say_pid_and_wait(folder: str) -> None:
-    (Path(folder) / str(os.getpid())).touch()
-    time.sleep(60)
+    """Leave a file named after this process, then wait; an interrupt is told by a second file."""
+    said = Path(folder) / str(os.getpid())
+    said.touch()
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        said.with_suffix(".interrupted").touch()
+        raise
 
 
 def die(signal_number: int) -> None:
@@ -102,12 +108,18 @@ wait_for_parent_without_prctl(sys.argv[1])
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path, code: str, workers: int) -> None:
     parent, pids = start(code, tmp_path, workers)
     parent.kill()
-    parent.communicate()
+    parent.wait()  # and not for its pipes, which an orphan would hold open
     assert_all_end(pids)
+    parent.communicate()
 
 
 def test_ctrl_c_ends_parent_and_workers_at_once_and_only_the_parent_speaks(tmp_path: Path) -> None:
     parent, pids = start(TWO_WORKERS, tmp_path, 2)
+    for pid in pids:
+        os.kill(pid, signal.SIGINT)
+    time.sleep(0.3)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert all(map(alive, pids))
     os.killpg(parent.pid, signal.SIGINT)
     _, error = parent.communicate(timeout=20)
     assert_all_end(pids)
