@@ -20,7 +20,9 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def make(*words: str) -> str:
     """Run `make` in the project; its output. The environment that runs the tests serves as the project's."""
-    ended = subprocess.run(["make", *words], cwd=ROOT, capture_output=True, text=True, check=False, env=dict(os.environ))
+    ended = subprocess.run(
+        ["make", *words], cwd=ROOT, capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout
 
@@ -39,7 +41,9 @@ def test_make_latents_walks_from_nothing_to_windows_of_latents_and_then_has_noth
     assert "2 training, 1 validation episodes" in first
     assert (tmp_path / "runs" / "vqgan-tiny" / "fidelity" / "worst.png").is_file()
 
-    windows = WindowDataset(tmp_path, split="train", latent_keys=latent_keys(tmp_path), window=EpisodeStore(tmp_path).spec().window)
+    windows = WindowDataset(
+        tmp_path, split="train", latent_keys=latent_keys(tmp_path), window=EpisodeStore(tmp_path).spec().window
+    )
     batch = next(iter(Loader(windows, batch_size=8, seed=0)))
     assert batch.latents["front"].shape == (8, 6, 3, 12, 20)
     assert batch.frames["side"].shape == (8, 96, 160, 3)

@@ -375,7 +375,7 @@ except StoreError as error:
 """
 
 
-@pytest.mark.parametrize("missing_bytes", [1, 100, 50_000])
+@pytest.mark.parametrize("missing_bytes", [2_000, 50_000])
 def test_a_full_disk_is_a_plain_error_and_leaves_nothing_behind(tmp_path: Path, missing_bytes: int) -> None:
     log = write_mcap(tmp_path / "a.mcap", height=240, width=320, image_codec="raw", n_frames=4)
     viewer.draw_log(log.path, tmp_path / "whole.rrd")

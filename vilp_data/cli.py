@@ -163,6 +163,12 @@ def ingest(
             + (f", {len(report.left_out)} failures left out" if report.left_out else "")
             + (f", {len(report.failed)} could not be read" if report.failed else "")
         )
+        if report.replaced:
+            print(f"  replaced, since their log changed: {', '.join(report.replaced)}")
+        if report.passed_over:
+            print(f"  passed over, of formats that are not read yet: {', '.join(report.passed_over)}")
+        for note in report.notes:
+            print(f"  {note}")
         for episode, findings in sorted(report.findings.items()):
             for finding in findings:
                 print(f"  {episode}: {finding}")

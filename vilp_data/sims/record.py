@@ -8,6 +8,7 @@ The last tick holds the final observation and the command to stand still, so eve
 
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
 import importlib.util
 import json
@@ -87,10 +88,11 @@ def record_task(
         progress(len(done), len(jobs))
     if todo:
         require_simulator(cameras=bool(options.get("cameras", True)))
-    for job, episode in map_unordered(_record_one, todo, workers=workers or cpu_count()):
-        done[job.seed] = episode
-        if progress is not None:
-            progress(len(done), len(jobs))
+    with contextlib.closing(map_unordered(_record_one, todo, workers=workers or cpu_count())) as recorded:
+        for job, episode in recorded:
+            done[job.seed] = episode
+            if progress is not None:
+                progress(len(done), len(jobs))
     return [done[job.seed] for job in jobs]
 
 
