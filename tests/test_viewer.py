@@ -357,7 +357,7 @@ def test_a_folder_that_is_missing_or_a_file_is_wrong_use(tmp_path: Path, in_the_
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a folder that nobody, not even root, may write into")
 def test_a_folder_without_permission_is_a_plain_error(tmp_path: Path) -> None:
     log = write_mcap(tmp_path / "a.mcap")
-    with pytest.raises(StoreError, match="the drawing cannot be written"):
+    with pytest.raises(StoreError, match="cannot be written"):
         viewer.draw_log(log.path, Path("/proc/a.rrd"))
 
 
@@ -382,8 +382,10 @@ def test_a_full_disk_is_a_plain_error_and_leaves_nothing_behind(tmp_path: Path, 
     (tmp_path / "out").mkdir()
     limit = (tmp_path / "whole.rrd").stat().st_size - missing_bytes
     arguments = [str(log.path), str(tmp_path / "out" / "a.rrd"), str(limit)]
-    ended = subprocess.run([sys.executable, "-c", LIMITED, *arguments], capture_output=True, text=True, check=True)
-    assert "the drawing cannot be written" in ended.stdout
+    ended = subprocess.run(
+        [sys.executable, "-c", LIMITED, *arguments], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert "cannot be written" in ended.stdout
     assert list((tmp_path / "out").iterdir()) == []
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from vilp_data import shards
 from vilp_data.decode import decode_image, encoded_image
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.plots import Plot
@@ -22,9 +22,7 @@ from vilp_data.types import I64, U8, Message
 
 APPLICATION = "vilp"
 TIMELINE = "log_time"
-FLUSH_BYTES = 8 << 20  # image bytes held back before they go to the file
-END_MARK = b"RRF2FOOT"
-END_SIZE = 12  # the mark and four bytes more
+FLUSH_BYTES = 8 << 20  # image bytes held back before they are sent together
 MAX_LEGEND = 9  # a longer legend would cover its plot
 MAX_PANELS = 4  # plots side by side; the rest are tabs of the last
 MAX_TABS = 8
@@ -58,16 +56,13 @@ class Drawn:
 
 
 class Canvas:
-    """An .rrd file being written. Times are nanoseconds; images are RGB, top row first."""
+    """An .rrd file in the making. Times are nanoseconds; images are RGB, top row first."""
 
-    def __init__(self, path: Path, *, wall_clock: bool) -> None:
+    def __init__(self, *, wall_clock: bool) -> None:
         self.id = uuid.uuid4().hex
-        self._path = path
         self._recording = rr.RecordingStream(APPLICATION, recording_id=self.id, send_properties=False)
-        try:
-            self._recording.save(str(path))
-        except RuntimeError as error:
-            raise _unwritable(path, error) from error
+        # Into memory, not to a file: Rerun's own file sink may hang on a full disk.
+        self._stream = self._recording.binary_stream()
         self._wall_clock = wall_clock
         self._held: dict[str, list[tuple[int, bytes, str]]] = {}
         self._held_bytes = 0
@@ -126,22 +121,12 @@ class Canvas:
         )
         self._recording.send_blueprint(blueprint)
 
-    def close(self) -> None:
-        """Write what is left. Raises StoreError where the file is not whole afterwards: no room, or no permission."""
+    def data(self) -> bytes:
+        """All that was drawn, as an .rrd file's bytes. Read once: each reading ends with an index of the file."""
         self._send_held()
-        try:
-            self._recording.flush()
-        except RuntimeError as error:
-            raise _unwritable(self._path, error) from error
-        finally:
-            self._recording.disconnect()
-        # What is written while disconnecting fails in silence: only the end mark shows that it did not.
-        if not _has_end(self._path):
-            raise _unwritable(self._path, "it lacks its end")
+        return self._stream.read() or b""
 
-    def abandon(self) -> None:
-        """Let go of a file that nobody wants any more."""
-        self._held.clear()
+    def close(self) -> None:
         self._recording.disconnect()
 
     def _send_held(self) -> None:
@@ -174,32 +159,12 @@ def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
         raise UsageError("no such folder", where=rrd.parent, remedy="make it, or save somewhere else")
     if rrd.is_dir():
         raise StoreError("a folder is in the way", where=rrd, remedy="save under another name")
-    temporary = rrd.with_name(f".{rrd.name}.{uuid.uuid4().hex}.tmp")
+    canvas = Canvas(wall_clock=wall_clock)
     try:
-        canvas = Canvas(temporary, wall_clock=wall_clock)
-        try:
-            yield canvas
-        except BaseException:
-            canvas.abandon()
-            raise
-        try:
-            canvas.close()
-            temporary.replace(rrd)
-        except OSError as error:
-            raise _unwritable(rrd, error) from error
+        yield canvas
+        shards.write_atomic(rrd, canvas.data())
     finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _has_end(rrd: Path) -> bool:
-    with rrd.open("rb") as stream:
-        stream.seek(max(stream.seek(0, os.SEEK_END) - END_SIZE, 0))
-        return stream.read().startswith(END_MARK)
-
-
-def _unwritable(path: Path, found: object) -> StoreError:
-    remedy = "free some space, or save where you may write"
-    return StoreError("the drawing cannot be written", where=path.parent, found=found, remedy=remedy)
+        canvas.close()
 
 
 def entity_of(topic: str, group: str = "") -> str:
