@@ -132,7 +132,10 @@ def inspect(
 @app.command()
 def ingest(
     logs: Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.", show_default=False)],
-    task: TaskOption = "",
+    task: Annotated[
+        str,
+        typer.Option(help="A built-in task, or a path to a task TOML. Default: that of the dataset last used here."),
+    ] = "",
     preset: PresetOption = None,
     into: Annotated[Path | None, typer.Option(help="Dataset folder. Default: data/TASK.", show_default=False)] = None,
     include_failures: Annotated[bool, typer.Option(help="Take episodes tagged as failures too.")] = False,
@@ -150,6 +153,7 @@ def ingest(
         root = into or default_root(spec.name, preset)
     else:
         root, spec = _dataset_and_its_spec(into)
+        console.print(f"dataset: {root}, its task {spec.name}", highlight=False)
     with progress_bar(f"ingesting into {root}", None) as advance:
         report = ingest_logs(
             logs, root, spec, workers=workers or cpu_count(), include_failures=include_failures, progress=advance
@@ -172,8 +176,8 @@ def ingest(
         for episode, findings in sorted(report.findings.items()):
             for finding in findings:
                 print(f"  {episode}: {finding}")
-        for _, message in report.failed:
-            print(f"  {message}", file=sys.stderr)
+        for name, message in report.failed:
+            print(f"  {name}: {message}", file=sys.stderr)
     if report.failed:
         raise typer.Exit(1)
 
@@ -206,13 +210,14 @@ def split(
 
     Example: vilp-data split --ratio 0.9
     """
-    from vilp_data.dataset_split import check_dataset_split, lock_path, update_split
+    from vilp_data.dataset_split import check_dataset_split, find_split, lock_path, update_split
 
     root, spec = _open(dataset)
     if check:
         findings = check_dataset_split(root)
         print_json(findings) if as_json else print("\n".join(findings) or f"{lock_path(root)}: nothing wrong")
         raise typer.Exit(1 if findings else 0)
+    kept = find_split(root) is not None and not redraw
     lock = update_split(
         root,
         ratio=spec.split.ratio if ratio is None else ratio,
@@ -228,6 +233,8 @@ def split(
     train, val = lock.ids("train"), lock.ids("val")
     drawn = f"ratio {lock.ratio:g} from the {lock.ratio_from}, seed {lock.seed}"
     print(f"{lock_path(root)}: {len(train)} training, {len(val)} validation episodes ({drawn})")
+    if kept:
+        print("  episodes placed before stay where they are; --redraw draws anew")
     for group in lock.duplicates:
         print(f"  identical, kept on one side: {', '.join(group)}")
     crossing = [pair for pair in lock.near_duplicates if lock.assignment[pair.first] != lock.assignment[pair.second]]

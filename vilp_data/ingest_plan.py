@@ -108,7 +108,11 @@ def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, plan: P
             plan.failed.append((path.name, str(empty)))
         for demonstration in demonstrations:
             sha256 = hashes[demonstration.name]
-            sources.setdefault(sha256, Source(path, demonstration, sha256, alone=len(demonstrations) == 1))
+            source = Source(path, demonstration, sha256, alone=len(demonstrations) == 1)
+            first = sources.setdefault(sha256, source)
+            if first is not source:
+                copied = "" if first.alone else f", {first.demonstration.name}"
+                plan.notes.append(f"{path}: a copy of {first.log}{copied}, byte for byte; taken once")
     return list(sources.values())
 
 

@@ -11,7 +11,7 @@ import typer
 
 from vilp_data.cli import JsonOption, PresetOption, print_json, progress_bar, run_app
 from vilp_data.episodes import EpisodeStore
-from vilp_data.locate import default_root, find_dataset, remember
+from vilp_data.locate import default_root, find_dataset, is_dataset, remember
 from vilp_data.spec import TaskSpec, load_task
 
 app = typer.Typer(
@@ -184,9 +184,11 @@ def _db(value: float | None) -> str:
 
 def _dataset(data: Path | None, task: str | None, preset: str | None) -> tuple[Path, TaskSpec]:
     """The dataset folder, and its spec; the models' tables come from the task's file of today where a task is named."""
-    root = find_dataset(data if data is not None or task is None else default_root(load_task(task).name, preset))
+    if data is None and task is not None:
+        name = load_task(task).name
+        data = next((root for root in (default_root(name, preset), default_root(name, None)) if is_dataset(root)), None)
+    root = find_dataset(data)
     remember(root)
-    if data is None:
-        print(f"dataset: {root}", file=sys.stderr)
+    print(f"dataset: {root}", file=sys.stderr)
     spec = EpisodeStore(root).spec()
     return root, spec if task is None else spec.model_copy(update={"models": load_task(task, preset=preset).models})

@@ -176,12 +176,15 @@ def load_vqgan(run: Path) -> tuple[VQModel, VqganRecipe]:
 def load_frame_encoder(run_dir: Path, view: str) -> VqganEncoder:
     """The frame encoder of one view: what the entry-point group `vilp.frame_encoders` names.
 
-    `run_dir` is what `train_vqgan` wrote. Raises UsageError where no VQGAN there was trained on this view, StoreError
-    where the checkpoint is damaged.
+    `run_dir` is what `train_vqgan` wrote. Raises UsageError where no VQGAN there was trained on this view to its end,
+    StoreError where the checkpoint is damaged.
     """
     run = run_for_view(run_dir, view)
-    model, recipe = load_vqgan(run)
     state = read_state(run)
+    if state is not None and not state.finished:
+        found, remedy = f"step {state.step} of {state.steps}", "run `vilp-models train vqgan` again: it goes on there"
+        raise UsageError("this network's training is not finished", where=run, found=found, remedy=remedy)
+    model, recipe = load_vqgan(run)
     return VqganEncoder(
         model,
         precision=recipe.encode_precision,
