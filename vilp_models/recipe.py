@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -146,25 +146,224 @@ VQGAN_PRESETS: Mapping[str, Mapping[str, Any]] = {
 comes on top."""
 
 
-def vqgan_recipe(models: Mapping[str, Mapping[str, Any]], *, preset: str | None, where: str) -> VqganRecipe:
-    """The preset's recipe (the paper's for None) with the keys of `models["vqgan"]` (`TaskSpec.models`) on top.
+class TrainingRecipe(Frozen):
+    """What every model that AdamW trains has in common.
+
+    schedule      linear warm-up, then "constant", or "cosine" down to zero at the last step
+    ema_power, ema_max
+                  the weights that others load are an average: decay 1 - (1 + step)^-ema_power, at most ema_max; 0 leaves
+                  averaging out
+    precision     of the training arithmetic (weights and optimiser stay float32)
+    """
+
+    steps: int = Field(gt=0)
+    batch_size: int = Field(gt=0)
+    learning_rate: float = Field(default=1e-4, gt=0)
+    betas: tuple[float, float] = (0.95, 0.999)
+    weight_decay: float = Field(default=1e-6, ge=0)
+    warmup_steps: int = Field(default=500, ge=0)
+    schedule: Literal["constant", "cosine"] = "cosine"
+    clip_norm: float | None = Field(default=1.0, gt=0)
+    ema_power: float = Field(default=0.75, ge=0)
+    ema_max: float = Field(default=0.9999, ge=0, lt=1)
+    precision: Precision = "f32"
+    seed: int = Field(default=0, ge=0)
+
+
+Condition = Literal["token", "tokens", "concat", "token+concat", "tokens+concat"]
+
+
+class PlannerRecipe(TrainingRecipe):
+    """[models.planner]: the latent video planner of each view. The defaults are the paper's.
+
+    Architecture
+    width, multipliers  channels of level i are width * multipliers[i]; every level but the last halves height and width, never time
+    blocks              residual blocks a level on the way down; one more on the way up
+    convolutions        "full" 3x3x3, or "factorised": 1x3x3 then 3x1x1
+    groups, head_size   of every GroupNorm; of every attention head
+    condition           how the present reaches the network (see `planner`): "token" is the paper's one pooled vector of all views and
+                        low_dim, "tokens" a grid of vectors a view, "concat" the present frames' latents beside the noisy ones
+    vision_width        channels of the first level of the ResNet that sees the frames
+    low_dim             whether low_dim is part of the condition; long videos need a planner without
+    clip                "future": frames t+Δt … t+NΔt (the paper's); "present": t … t+(N-1)Δt, the first one known (the release's)
+
+    Diffusion
+    train_steps         levels of noise in training
+    prediction          "v" with zero terminal SNR, or "epsilon"
+    spacing             of the sampler's steps: "trailing" begins at pure noise, "leading" as the release does. epsilon needs "leading"
+    sampler, denoising_steps
+                        "ddim" (eta 0) or "dpm++" (diffusers' second-order multistep solver), and how many steps, unless told otherwise
+    """
+
+    width: int = Field(default=64, gt=0)
+    multipliers: tuple[int, ...] = Field(default=(1, 2, 4), min_length=1)
+    blocks: int = Field(default=2, gt=0)
+    convolutions: Literal["full", "factorised"] = "full"
+    groups: int = Field(default=32, gt=0)
+    head_size: int = Field(default=8, gt=0)
+    condition: Condition = "token"
+    vision_width: int = Field(default=64, gt=0)
+    low_dim: bool = True
+    clip: Literal["future", "present"] = "future"
+
+    train_steps: int = Field(default=300, gt=1)
+    prediction: Literal["v", "epsilon"] = "v"
+    spacing: Literal["trailing", "leading"] = "trailing"
+    sampler: Literal["ddim", "dpm++"] = "ddim"
+    denoising_steps: int = Field(default=4, gt=0)
+
+    steps: int = Field(default=300_000, gt=0)
+    batch_size: int = Field(default=64, gt=0)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels of every level, finest first."""
+        return tuple(self.width * m for m in self.multipliers)
+
+    @model_validator(mode="after")
+    def _values_fit(self) -> Self:
+        bad = [c for c in self.channels if c % self.groups or c % self.head_size]
+        if bad:
+            raise ValueError(
+                f"groups = {self.groups} and head_size = {self.head_size} must divide the channels of every level "
+                f"(width x multipliers): {self.channels}"
+            )
+        if self.prediction == "epsilon" and self.spacing == "trailing":
+            raise ValueError(
+                'prediction = "epsilon" cannot begin at pure noise, where it is multiplied without bound: spacing = "leading", '
+                'or prediction = "v"'
+            )
+        if self.denoising_steps > self.train_steps:
+            raise ValueError(f"denoising_steps = {self.denoising_steps} is more than train_steps = {self.train_steps}")
+        if self.condition == "concat" and self.low_dim:
+            raise ValueError('condition = "concat" has no place for low_dim: low_dim = false, or "token+concat"')
+        return self
+
+
+Pool = Literal["average", "keypoints"]
+
+
+class PolicyRecipe(TrainingRecipe):
+    """[models.policy]: the low-level policy, two adjacent frames to the actions between. The defaults are the paper's.
+
+    sees                 "frames", or "latents": quantised ones, which skips the decoder when imagined frames are acted on
+    vision_width         channels of the first level of each view's ResNet
+    pool                 "average" over the image, or "keypoints": the expected position of each channel (spatial softmax)
+    shared_vision        one ResNet for both frames, or one each
+    hidden               widths of the MLP
+    low_dim              whether low_dim at the first frame is seen too
+    reconstructed_share  share of second frames that are replaced by the VQGAN's reconstruction, as imagined ones will be
+    """
+
+    sees: Literal["frames", "latents"] = "frames"
+    vision_width: int = Field(default=64, gt=0)
+    pool: Pool = "average"
+    shared_vision: bool = True
+    hidden: tuple[int, ...] = (256, 256)
+    low_dim: bool = False
+    reconstructed_share: float = Field(default=0.0, ge=0, le=1)
+
+    steps: int = Field(default=100_000, gt=0)
+    batch_size: int = Field(default=256, gt=0)
+
+    @model_validator(mode="after")
+    def _values_fit(self) -> Self:
+        if self.sees == "latents" and self.reconstructed_share:
+            raise ValueError('latents are the VQGAN\'s already: reconstructed_share must be 0 where sees = "latents"')
+        return self
+
+
+class BcRecipe(TrainingRecipe):
+    """[models.bc]: behaviour cloning, one observation to the same chunk of actions that VILP executes. A baseline.
+
+    n_action_steps is VILP's ([models.vilp]); the other keys are as in [models.policy].
+    """
+
+    vision_width: int = Field(default=64, gt=0)
+    pool: Pool = "average"
+    hidden: tuple[int, ...] = (256, 256)
+    low_dim: bool = True
+
+    steps: int = Field(default=100_000, gt=0)
+    batch_size: int = Field(default=256, gt=0)
+
+
+class VilpRecipe(Frozen):
+    """[models.vilp]: how the policy acts; nothing here is trained.
+
+    n_action_steps  (paper N_e) actions executed before planning again
+    """
+
+    n_action_steps: int = Field(default=8, gt=0)
+
+
+_ADAM_SMALL: Mapping[str, Any] = {"learning_rate": 1e-3, "betas": (0.9, 0.99), "weight_decay": 1e-4, "ema_max": 0.999}
+
+PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "vqgan": VQGAN_PRESETS,
+    "planner": {
+        "tiny": {
+            **_ADAM_SMALL, "width": 16, "multipliers": (1, 2), "blocks": 1, "groups": 8, "convolutions": "factorised",
+            "condition": "token+concat", "vision_width": 8, "steps": 12, "batch_size": 4, "warmup_steps": 2,
+        },
+        "cpu": {
+            **_ADAM_SMALL, "width": 48, "multipliers": (1, 2, 4), "blocks": 1, "groups": 16, "convolutions": "factorised",
+            "condition": "token+concat", "vision_width": 16, "steps": 8000, "batch_size": 32, "warmup_steps": 100,
+            "precision": "bf16",
+        },
+        "paper": {},
+    },
+    "policy": {
+        "tiny": {**_ADAM_SMALL, "vision_width": 8, "pool": "keypoints", "hidden": (64,), "steps": 12, "batch_size": 8, "warmup_steps": 2},
+        "cpu": {
+            **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints",
+            "steps": 4000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
+        },
+        "paper": {},
+    },
+    "bc": {
+        "tiny": {**_ADAM_SMALL, "vision_width": 8, "pool": "keypoints", "hidden": (64,), "steps": 12, "batch_size": 8, "warmup_steps": 2},
+        "cpu": {
+            **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints",
+            "steps": 4000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
+        },
+        "paper": {},
+    },
+    "vilp": {"tiny": {}, "cpu": {}, "paper": {}},
+}  # fmt: skip
+"""model -> preset -> what it changes in that model's recipe (the paper's), for every task."""
+
+AnyRecipe = TypeVar("AnyRecipe", bound=Frozen)
+
+
+def load_recipe(
+    kind: type[AnyRecipe], name: str, models: Mapping[str, Mapping[str, Any]], *, preset: str | None, where: str
+) -> AnyRecipe:
+    """The recipe of model `name` ("planner", "policy", …): the preset's (the paper's for None) with the keys of
+    `models[name]` (`TaskSpec.models`) on top.
 
     Raises UsageError for an unknown preset, SpecError that names `where`, the key and the nearest known one.
     """
-    if preset is not None and preset not in VQGAN_PRESETS:
-        raise UsageError(f"unknown preset {preset!r}", where=where, remedy=nearest(preset, VQGAN_PRESETS))
-    table = {**VQGAN_PRESETS[preset or "paper"], **models.get("vqgan", {})}
-    unknown = [key for key in table if key not in VqganRecipe.model_fields]
+    presets = PRESETS[name]
+    if preset is not None and preset not in presets:
+        raise UsageError(f"unknown preset {preset!r}", where=where, remedy=nearest(preset, presets))
+    table = {**presets[preset or "paper"], **models.get(name, {})}
+    unknown = [key for key in table if key not in kind.model_fields]
     if unknown:
         raise SpecError(
-            f"unknown key models.vqgan.{unknown[0]}", where=where, remedy=nearest(unknown[0], VqganRecipe.model_fields)
+            f"unknown key models.{name}.{unknown[0]}", where=where, remedy=nearest(unknown[0], kind.model_fields)
         )
     try:
-        return VqganRecipe.model_validate(table)
+        return kind.model_validate(table)
     except ValidationError as error:
         found = "\n          ".join(
             f"{'.'.join(map(str, item['loc'])) or 'together'}: {item['msg']}" for item in error.errors()
         )
         raise SpecError(
-            "[models.vqgan] cannot be used", where=where, found=found, remedy="correct these values"
+            f"[models.{name}] cannot be used", where=where, found=found, remedy="correct these values"
         ) from error
+
+
+def vqgan_recipe(models: Mapping[str, Mapping[str, Any]], *, preset: str | None, where: str) -> VqganRecipe:
+    """`load_recipe` for the VQGAN."""
+    return load_recipe(VqganRecipe, "vqgan", models, preset=preset, where=where)
