@@ -1,9 +1,11 @@
 # make latents TASK=hanoi        episode logs -> cached VQGAN latents, everything before it included
+# make rollout TASK=pusht LOGS=… … -> planner and low-level policy -> VILP in the simulator, everything before it included
 # make test                      lint, types, import rules, tests
 #
 # TASK    a task in pipelines/: hanoi, pusht      PRESET  tiny | cpu | paper
 # LOGS    your own logs (files or folders) instead of recorded ones
-# DATA    the dataset folder                      TORCH   what pip installs as torch
+# SEEDS   which starts a rollout has, FIRST:END   TORCH   what pip installs as torch
+# DATA    the dataset folder
 
 TASK   ?= hanoi
 PRESET ?= cpu
@@ -15,15 +17,17 @@ PYTHON ?= python3
 BIN   := .venv/bin
 READY := .venv/.ready
 RUN   := $(DATA)/runs/vqgan-$(PRESET)
+MODEL := --data $(DATA) --task $(TASK) --preset $(PRESET)
+SEEDS ?= $(if $(filter tiny,$(PRESET)),0:2,0:50)
 LOGS_IN := $(if $(LOGS),$(LOGS),$(DATA)/logs)
 SUDO  := $(if $(filter 0,$(shell id -u)),,$(shell command -v sudo >/dev/null && echo sudo -n))
 
 export MUJOCO_GL ?= osmesa
 
-.PHONY: setup record ingest split vqgan latents view replay test test-slow lint bench docs clean help
+.PHONY: setup record ingest split vqgan latents planner policy bc generate rollout view replay test test-slow lint bench docs clean help
 
 help:
-	@sed -n '1,8p' Makefile
+	@sed -n '1,9p' Makefile
 
 # --- set-up ----------------------------------------------------------------------------------------------------------
 
@@ -51,8 +55,30 @@ latents: vqgan
 	@$(BIN)/vilp-data latents $(DATA) --run $(RUN)
 	@$(BIN)/vilp-models evaluate vqgan --data $(DATA) --run $(RUN) || [ $$? -eq 1 ]  # 1: it warns, in words
 
+planner: latents
+	@$(BIN)/vilp-models train planner $(MODEL)
+	@$(BIN)/vilp-models evaluate planner $(MODEL) $(if $(filter tiny,$(PRESET)),--starts 4 --samples 2) || [ $$? -eq 1 ]
+
+policy: latents
+	@$(BIN)/vilp-models train policy $(MODEL)
+	@$(BIN)/vilp-models evaluate policy $(MODEL) || [ $$? -eq 1 ]
+
+bc: split
+	@$(BIN)/vilp-models train bc $(MODEL)
+
+generate: planner
+	@$(BIN)/vilp-models generate $(MODEL)
+
+rollout: planner policy
+	@$(BIN)/vilp-models rollout $(MODEL) --policy stay --seeds $(SEEDS)
+	@$(BIN)/vilp-models rollout $(MODEL) --policy vilp --seeds $(SEEDS)
+
+# the newest log there is, of a policy or of the recorder; without any, the first ingested episode
 view: $(READY)
-	@$(BIN)/vilp-data view $$(ls $(DATA)/logs/*.mcap | head -1)
+	@log=$$(ls -t $(DATA)/rollouts/*/logs/*.mcap $(DATA)/logs/*.mcap 2>/dev/null | head -1); \
+	episode=$$(ls $(DATA)/episodes/steps 2>/dev/null | head -1); \
+	if [ -n "$$log" ]; then $(BIN)/vilp-data view "$$log" --task $(TASK); \
+	else $(BIN)/vilp-data view "$${episode%.safetensors}" --data $(DATA); fi
 
 replay: ingest
 	@$(BIN)/vilp-models rollout --data $(DATA) --policy replay --episodes 3

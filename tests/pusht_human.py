@@ -19,7 +19,7 @@ N_EPISODES = 206
 def simulator() -> Any:
     """A fresh Push-T, as the task's `sim.env` makes it; skips where the simulators are not installed."""
     pytest.importorskip("gym_pusht", reason="the simulators are not installed: make setup")
-    from vilp_models.rollout import make_env
+    from vilp_models.simulator import make_env
 
     return make_env(load_task("pusht"))
 

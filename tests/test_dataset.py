@@ -10,65 +10,17 @@ import numpy as np
 import pytest
 import torch
 
+from tests.stored_episodes import KEYS, VIEWS, add_episodes, episode, write_dataset, write_latents
 from vilp_data import shards
 from vilp_data.dataset import WindowDataset, WindowTensors
-from vilp_data.episodes import EpisodeStore, Origin
+from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import SplitError, StoreError, UsageError
 from vilp_data.latents import latents_path
-from vilp_data.spec import WindowSpec, task_from_dict
-from vilp_data.split import SplitEpisode, draw_split
+from vilp_data.spec import WindowSpec
 from vilp_data.split_lock import Side, SplitLock, assignment_hash
 from vilp_data.types import Episode
 
-VIEWS = ("front", "side")
-KEYS = {"front": "key-a", "side": "key-b"}
 WINDOW = WindowSpec(n_plan_frames=3, frame_stride=2, max_goal_frames=2)
-
-
-def episode(name: str, n_steps: int, *, with_action: bool = True, invalid: tuple[int, ...] = ()) -> Episode:
-    """Random content; the side camera runs at half rate, so that its stored frames are not its steps."""
-    rng = np.random.default_rng([n_steps, *name.encode()])
-    source_index = {"front": np.arange(n_steps, dtype=np.int32), "side": (np.arange(n_steps) // 2).astype(np.int32)}
-    valid = np.ones(n_steps, np.bool_)
-    valid[list(invalid)] = False
-    return Episode(
-        id=name,
-        frames={
-            view: rng.integers(0, 256, (index[-1] + 1, 8, 16, 3), dtype=np.uint8)
-            for view, index in source_index.items()
-        },
-        source_index=source_index,
-        log_time_ns=np.arange(n_steps, dtype=np.int64),
-        low_dim=rng.standard_normal((n_steps, 4)).astype(np.float32),
-        action=rng.standard_normal((n_steps, 2)).astype(np.float32) if with_action else None,
-        state=None,
-        valid=valid,
-        age_s={},
-        rate_hz=10.0,
-        tags={},
-        outcome="success",
-    )
-
-
-def write_latents(root: Path, name: str, *, views: tuple[str, ...] = VIEWS) -> None:
-    entry = EpisodeStore(root).entry(name)
-    for view in views:
-        latents = np.random.default_rng(len(name)).standard_normal((entry.n_frames[view], 3, 2, 4)).astype(np.float16)
-        header = {"source_frames_sha256": entry.frames_sha256[view]}
-        shards.write_shard(latents_path(root, view, KEYS[view], name), {"latents": latents}, header)
-
-
-def write_split(root: Path, *, ratio: float = 0.5) -> None:
-    episodes = [SplitEpisode(entry.id, entry.content_sha256) for entry in EpisodeStore(root).index()]
-    shards.write_atomic(root / "split.lock.json", draw_split(episodes, ratio=ratio, seed=0).to_json())
-
-
-def add_episodes(root: Path, *episodes: Episode) -> None:
-    store = EpisodeStore(root)
-    for one in episodes:
-        store.write(one, Origin("test", "", one.id, "", {}))
-    store.write_index()
-
 
 EPISODES = (
     episode("a", 12),
@@ -80,12 +32,7 @@ EPISODES = (
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    views = {view: {"topic": f"/{view}", "height": 8, "width": 16} for view in VIEWS}
-    EpisodeStore(tmp_path).write_spec(task_from_dict({"name": "test", "views": views}, where="test"))
-    add_episodes(tmp_path, *EPISODES)
-    for one in EPISODES:
-        write_latents(tmp_path, one.id)
-    write_split(tmp_path)
+    write_dataset(tmp_path, *EPISODES)
     return tmp_path
 
 
@@ -118,6 +65,7 @@ def test_every_window_holds_what_the_episode_holds(root: Path) -> None:
         for view in VIEWS:
             stored = shards.read_shard(latents_path(root, view, KEYS[view], one.id)).arrays["latents"]
             np.testing.assert_array_equal(batch.latents[view][row], stored[one.source_index[view][planned]])
+            np.testing.assert_array_equal(batch.present_latents[view][row], stored[one.source_index[view][t]])
             np.testing.assert_array_equal(batch.frames[view][row], one.frames[view][one.source_index[view][t]])
         np.testing.assert_array_equal(batch.low_dim[row], one.low_dim[t])
         recorded = [one.action is not None and k <= last for k in range(t, t + 6)]
@@ -136,6 +84,9 @@ def test_values_are_handed_out_as_stored(root: Path) -> None:
     )
     assert {view: (t.dtype, tuple(t.shape)) for view, t in batch.latents.items()} == dict.fromkeys(
         VIEWS, (torch.float16, (2, 3, 3, 2, 4))
+    )
+    assert {view: (t.dtype, tuple(t.shape)) for view, t in batch.present_latents.items()} == dict.fromkeys(
+        VIEWS, (torch.float16, (2, 3, 2, 4))
     )
     assert batch.low_dim.dtype == torch.float32
     assert batch.action is not None
@@ -171,7 +122,16 @@ def test_frames_and_actions_can_be_left_out(root: Path) -> None:
     assert batch.frames == {}
     assert batch.action is None
     assert not batch.action_mask.any()
-    assert batch.latents.keys() == KEYS.keys()
+    assert batch.latents.keys() == batch.present_latents.keys() == KEYS.keys()
+
+
+def test_frames_need_no_latents(root: Path) -> None:
+    with_latents = opened(root).read([0, 5])
+    batch = opened(root, latent_keys={}, views=("side",)).read([0, 5])
+    assert batch.latents == batch.present_latents == {}
+    assert list(batch.frames) == ["side"]
+    assert torch.equal(batch.frames["side"], with_latents.frames["side"])
+    assert opened(root, latent_keys={"front": "key-a"}, views=VIEWS).read([0]).frames.keys() == set(VIEWS)
 
 
 def test_one_view_reads_one_view(root: Path) -> None:
@@ -292,6 +252,8 @@ def test_an_unknown_key_or_view_is_refused(root: Path) -> None:
         opened(root, latent_keys={"front": "no-such-key"})
     with pytest.raises(UsageError, match="did you mean 'front'"):
         opened(root, latent_keys={"frnt": "key-a"})
+    with pytest.raises(UsageError, match="did you mean 'side'"):
+        opened(root, views=("sid",))
 
 
 def test_no_split_names_the_command(root: Path) -> None:
@@ -334,7 +296,7 @@ def rows(batch: WindowTensors, part: slice) -> WindowTensors:
 
 
 def assert_equal(a: WindowTensors, b: WindowTensors) -> None:
-    for name in ("frames", "latents"):
+    for name in ("frames", "latents", "present_latents"):
         assert getattr(a, name).keys() == getattr(b, name).keys()
         for view, tensor in getattr(a, name).items():
             assert torch.equal(tensor, getattr(b, name)[view])

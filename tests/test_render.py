@@ -9,7 +9,7 @@ import pytest
 
 from tests.pusht_human import N_EPISODES, human_episode, simulator
 from vilp_data.errors import UsageError
-from vilp_models.rollout import RENDER_MIN_DB, format_render, render_match
+from vilp_models.replay import RENDER_MIN_DB, format_render, render_match
 
 pytestmark = pytest.mark.sim
 

@@ -12,7 +12,8 @@ from tests.pusht_human import N_EPISODES, human_episode, simulator
 from vilp_data.errors import UsageError
 from vilp_data.spec import parse_task
 from vilp_data.types import Episode
-from vilp_models.rollout import format_replay, make_env, replay
+from vilp_models.replay import format_replay, replay
+from vilp_models.simulator import make_env
 
 TOLERANCE_PX = 1e-3
 

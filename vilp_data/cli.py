@@ -139,6 +139,9 @@ def ingest(
     preset: PresetOption = None,
     into: Annotated[Path | None, typer.Option(help="Dataset folder. Default: data/TASK.", show_default=False)] = None,
     include_failures: Annotated[bool, typer.Option(help="Take episodes tagged as failures too.")] = False,
+    with_rollouts: Annotated[
+        bool, typer.Option("--with-rollouts", help="Take episodes that a policy made too; no model trains on them.")
+    ] = False,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -156,8 +159,9 @@ def ingest(
         console.print(f"dataset: {root}, its task {spec.name}", highlight=False)
     with progress_bar(f"ingesting into {root}", None) as advance:
         report = ingest_logs(
-            logs, root, spec, workers=workers or cpu_count(), include_failures=include_failures, progress=advance
-        )
+            logs, root, spec, workers=workers or cpu_count(), include_failures=include_failures,
+            with_rollouts=with_rollouts, progress=advance,
+        )  # fmt: skip
     remember(root)
     if as_json:
         print_json(dataclasses.asdict(report))
@@ -167,6 +171,8 @@ def ingest(
             + (f", {len(report.left_out)} failures left out" if report.left_out else "")
             + (f", {len(report.failed)} could not be read" if report.failed else "")
         )
+        if report.rollouts:
+            print(f"  {len(report.rollouts)} rollouts of a policy left out; --with-rollouts takes them")
         if report.replaced:
             print(f"  replaced, since their log changed: {', '.join(report.replaced)}")
         if report.passed_over:

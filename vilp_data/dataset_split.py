@@ -1,4 +1,8 @@
-"""The split of a dataset folder: split.lock.json read, drawn from the stored episodes, written."""
+"""The split of a dataset folder: split.lock.json read, drawn from the stored episodes, written.
+
+A policy's own episodes (`types.is_rollout`) may be stored and viewed, but are on neither side: no model learns from them, and
+none is judged by them.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError
 from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
 from vilp_data.split_lock import Side, SplitLock
+from vilp_data.types import is_rollout
 
 
 def lock_path(root: Path) -> Path:
@@ -44,7 +49,7 @@ def side_episodes(store: EpisodeStore, side: Side) -> list[EpisodeEntry]:
 
     Raises SplitError as `read_split` does, and where a stored episode has no side yet."""
     lock, entries = read_split(store.root), store.index()
-    unassigned = [entry.id for entry in entries if entry.id not in lock.assignment]
+    unassigned = [entry.id for entry in entries if entry.id not in lock.assignment and not is_rollout(entry.tags)]
     if unassigned:
         raise SplitError(
             "the split does not cover every episode",
@@ -52,7 +57,7 @@ def side_episodes(store: EpisodeStore, side: Side) -> list[EpisodeEntry]:
             found=f"{len(unassigned)} without a side, such as {unassigned[0]}",
             remedy=f"run `vilp-data split {store.root}`: it places what is new and moves nothing",
         )
-    return [entry for entry in entries if lock.assignment[entry.id] == side]
+    return [entry for entry in entries if lock.assignment.get(entry.id) == side]
 
 
 def update_split(
@@ -96,8 +101,10 @@ def check_dataset_split(root: Path) -> list[str]:
 
 
 def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str, ...]) -> Iterator[SplitEpisode]:
-    """What the split needs to know of each stored episode."""
+    """What the split needs to know of each stored episode that is to have a side."""
     for entry in store.index():
+        if is_rollout(entry.tags):
+            continue
         for tag in (*strata, *([group_by] if group_by else [])):
             if tag not in entry.tags:
                 raise SplitError(

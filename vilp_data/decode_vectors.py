@@ -123,6 +123,8 @@ def _parse_path(path: str) -> tuple[Step, ...]:
 
 def _follow(message: Message, path: str, steps: tuple[Step, ...]) -> Any:
     value = message.body
+    if steps and not isinstance(steps[0], _Member) and not isinstance(value, np.ndarray):
+        value = _bare_array(message)
     for step in steps:
         if isinstance(step, _Member):
             try:
@@ -134,6 +136,16 @@ def _follow(message: Message, path: str, steps: tuple[Step, ...]) -> Any:
         else:
             value = _item(message, path, value, step)
     return value
+
+
+def _bare_array(message: Message) -> Any:
+    """What "[0:2]" indexes in a message that is no array: the only field that its schema's vector is made of, as of the std_msgs
+    arrays; else the message itself, which has no items."""
+    fields = DEFAULT_FIELDS.get(message.schema, ())
+    if len(fields) != 1:
+        return message.body
+    (path,) = fields
+    return _follow(message, path, _parse_path(path))
 
 
 def _item(message: Message, path: str, value: Any, step: int | slice) -> Any:

@@ -50,6 +50,7 @@ class IngestReport:
     """What became of every demonstration found in the logs.
 
     written, fresh, left_out  ids of episodes: stored now, there already, and not wanted since they failed
+    rollouts     ids of a policy's own episodes, not wanted unless asked for
     replaced     those of `written` that took the place of an episode with other content, since their log changed
     failed       (id, or name of a log) and why nothing came of it
     findings     id -> what was masked or repeated in it
@@ -61,6 +62,7 @@ class IngestReport:
     replaced: list[str] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    rollouts: list[str] = field(default_factory=list)
     failed: list[tuple[str, str]] = field(default_factory=list)
     findings: dict[str, tuple[str, ...]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -68,7 +70,7 @@ class IngestReport:
 
 
 def ingest_logs(
-    logs: Sequence[Path], root: Path, spec: TaskSpec, *, workers: int, include_failures: bool = False,
+    logs: Sequence[Path], root: Path, spec: TaskSpec, *, workers: int, include_failures: bool = False, with_rollouts: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> IngestReport:  # fmt: skip
     """Ingest every demonstration of `logs` into the dataset at `root`. What is there under today's key is left alone; what cannot
@@ -81,10 +83,10 @@ def ingest_logs(
     store = EpisodeStore(root)
     with shards.writer_lock(root):
         cache = HashCache(root)
-        plan = make_plan(found.logs, store, spec, cache, include_failures=include_failures)
+        plan = make_plan(found.logs, store, spec, cache, include_failures=include_failures, with_rollouts=with_rollouts)
         cache.save()
         report = IngestReport(
-            fresh=plan.fresh, left_out=plan.left_out, failed=plan.failed, notes=plan.notes,
+            fresh=plan.fresh, left_out=plan.left_out, rollouts=plan.rollouts, failed=plan.failed, notes=plan.notes,
             passed_over=[str(path) for path in found.passed_over],
         )  # fmt: skip
         if plan.fresh:

@@ -24,7 +24,7 @@ from vilp_data.keys import episode_key, first_difference
 from vilp_data.log_hashes import HashCache
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
-from vilp_data.types import LogEpisode
+from vilp_data.types import LogEpisode, is_rollout
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,14 @@ class Planned:
 
 @dataclass
 class Plan:
-    """`todo` in order of logs; ids of what is fresh, left out as a failure, or replaced by what is to do; what could not be read
-    (name, why); sentences about names that are not what they were; `rate_hz` of the episodes that stay, None where none do."""
+    """`todo` in order of logs; ids of what is fresh, left out as a failure, a policy's `rollouts` left out, `replaced` by what is to
+    do; what could not be read (name, why); sentences about names that are not what they were; `rate_hz` of the episodes that
+    stay, None where none do."""
 
     todo: list[Planned] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    rollouts: list[str] = field(default_factory=list)
     replaced: set[str] = field(default_factory=set)
     failed: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -61,7 +63,13 @@ class Plan:
 
 
 def make_plan(
-    logs: Sequence[Path], store: EpisodeStore, spec: TaskSpec, cache: HashCache, *, include_failures: bool
+    logs: Sequence[Path],
+    store: EpisodeStore,
+    spec: TaskSpec,
+    cache: HashCache,
+    *,
+    include_failures: bool,
+    with_rollouts: bool,
 ) -> Plan:
     """Compare logs with the store. Raises UsageError where the dataset is of another task, or where episodes ingested by another
     spec would stay in it."""
@@ -78,6 +86,8 @@ def make_plan(
         key = episode_key(source_sha256=source.sha256, source_episode=name, ingest_fields=fields)
         if entry is not None and entry.key == key and store.frames_fit(entry):
             plan.fresh.append(episode_id)
+        elif is_rollout(source.demonstration.tags) and not with_rollouts:
+            plan.rollouts.append(episode_id)
         elif outcome_of(source.demonstration.tags) == "failure" and not include_failures:
             plan.left_out.append(episode_id)
         else:

@@ -109,10 +109,11 @@ class WindowSpec(Frozen):
 
 
 class SimSpec(Frozen):
-    """The simulator of this task: a gymnasium id, and keyword arguments for it."""
+    """The simulator of this task: a gymnasium id, keyword arguments for it, and how many steps a policy may take in it."""
 
     env: str
     options: dict[str, Any] = {}
+    max_steps: int = Field(default=300, gt=0)
 
 
 class RecordSpec(Frozen):

@@ -33,6 +33,15 @@ Outcome = Literal["success", "failure", "unknown"]
 EPISODE_RECORD = "episode"
 """Name of the metadata record in which a log says what it shows (task, seed, success, …): it becomes the episode's tags."""
 
+ROLLOUT_TAG = ("source", "rollout")
+"""The tag of an episode that a policy under trial made. Demonstrations (people's, scripted experts') do not bear it."""
+
+
+def is_rollout(tags: Mapping[str, str]) -> bool:
+    """Whether these are the tags of a policy's own episode, which no model is to learn from unless someone asks for that."""
+    name, value = ROLLOUT_TAG
+    return tags.get(name) == value
+
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:

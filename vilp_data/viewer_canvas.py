@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from vilp_data import shards
 from vilp_data.decode import decode_image, encoded_image
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.plots import Plot
-from vilp_data.types import I64, U8, Message
+from vilp_data.types import F64, I64, U8, Message
 
 APPLICATION = "vilp"
 TIMELINE = "log_time"
@@ -165,6 +165,26 @@ def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
         shards.write_atomic(rrd, canvas.data())
     finally:
         canvas.close()
+
+
+def draw_clip(
+    rrd: Path, rows: Mapping[str, Mapping[str, U8]], times_ns: I64, psnr: Mapping[str, Mapping[str, F64]]
+) -> Drawn:
+    """Draw a clip that is no episode: for each view a row of named pictures, uint8 [n,H,W,3] at `times_ns` [n] since its start, and
+    below a plot of each view's named PSNR in dB, float64 [n], where it is defined. Raises as `writing` does."""
+    with writing(rrd, wall_clock=False) as canvas:
+        pictures = []
+        for view, panels in rows.items():
+            for name, frames in panels.items():
+                canvas.frames(entity_of(view, name), frames, times_ns)
+            pictures.append([Picture(entity_of(view, name), f"{view}: {name}") for name in panels])
+        plots = [Plot(f"{view}: PSNR in dB", entity_of(view, "psnr")) for view in psnr]
+        for plot, values in zip(plots, psnr.values(), strict=True):
+            for row, time_ns in enumerate(times_ns.tolist()):
+                plot.add(time_ns, {name: float(line[row]) for name, line in values.items()})
+        canvas.plots(iter(plots))
+        canvas.layout(pictures, [[plot] for plot in plots])
+    return Drawn(rrd, canvas.id, canvas.moment(int(times_ns[len(times_ns) // 2])))
 
 
 def entity_of(topic: str, group: str = "") -> str:

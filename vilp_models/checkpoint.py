@@ -1,7 +1,8 @@
 """Checkpoints: one safetensors file a run, replaced whole: all that resuming needs, and nothing that runs code.
 
 A run's folder is `<run_dir>/<views joined by +>/`, since views may share one network:
-    checkpoint.safetensors   model/… and trainer/… (optimiser, discriminator, counters); its header: recipe and state
+    checkpoint.safetensors   model/…, what others load: averaged weights where training averages; and trainer/… (weights as
+                             they are trained, optimiser, discriminator, counters). Its header: recipe and state
     recipe.json              the resolved recipe again, for people
 """
 
@@ -10,15 +11,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from vilp_data.errors import StoreError, UsageError, nearest
+from vilp_data.episodes import EpisodeEntry
+from vilp_data.errors import SplitError, StoreError, UsageError, nearest
 from vilp_data.shards import open_shard, read_header, read_shard, verify_shard, write_atomic, write_shard
+from vilp_models.contract import DataContract
 
 FORMAT = "vilp-checkpoint-1"
 FILE = "checkpoint.safetensors"
@@ -35,6 +38,9 @@ class RunState:
     split_hash      hash of the split that chose the episodes, to find the lock in a project's history. It decides nothing: a
                     split that only grew has another hash, so what is compared is train_episodes
     train_episodes  episode id -> episode key, of every training episode
+    model           kind of model: "vqgan", "planner", "policy", "bc"
+    contract        `DataContract.to_json` of the dataset it learns from; None for a VQGAN, which depends on frames alone
+    built_by        what decides the network besides recipe and contract: {"n_action_steps": …} for "bc", else nothing
     """
 
     step: int
@@ -42,6 +48,9 @@ class RunState:
     views: tuple[str, ...]
     split_hash: str
     train_episodes: Mapping[str, str]
+    model: str = "vqgan"  # checkpoints of before there were others name none
+    contract: Mapping[str, Any] | None = None
+    built_by: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def finished(self) -> bool:
@@ -114,6 +123,45 @@ def read_recipe(run: Path) -> dict[str, Any]:
 def read_state(run: Path) -> RunState | None:
     """Where the run is, without reading its tensors; None where it has not begun."""
     return _state(_header(run)) if (run / FILE).is_file() else None
+
+
+class TrainedRun(NamedTuple):
+    """What a run left for those who use its model: `recipe` and `contract` say how to build it, `arrays` are its tensors."""
+
+    recipe: dict[str, Any]
+    contract: DataContract
+    state: RunState
+    arrays: Arrays
+
+
+def load_run(run: Path, kind: str, *, unfinished: bool = False) -> TrainedRun:
+    """The model of this kind ("planner", "policy", "bc") trained in this folder; its tensors checked and writable.
+
+    Raises UsageError where there is none, one of another kind, or one whose training is not finished (unless that is
+    wanted), StoreError where the checkpoint is damaged."""
+    state = read_state(run)
+    train = f"`vilp-models train {kind}`"
+    if state is None:
+        raise UsageError(f"no trained {kind}", where=run, remedy=f"train one with {train}")
+    if state.model != kind or state.contract is None:
+        raise UsageError(f"not a {kind}", where=run, found=state.model, remedy=f"name the run of a {kind}")
+    if not state.finished and not unfinished:
+        found, remedy = f"step {state.step} of {state.steps}", f"run {train} again: it goes on there"
+        raise UsageError("this network's training is not finished", where=run, found=found, remedy=remedy)
+    return TrainedRun(read_recipe(run), DataContract.from_json(state.contract), state, model_tensors(run))
+
+
+def refuse_trained_on_validation(state: RunState, val: Sequence[EpisodeEntry], *, where: Path) -> None:
+    """Raise SplitError where the run in `where` was trained on one of these episodes: it knows what it would be judged on."""
+    leaked = sorted(entry.id for entry in val if entry.id in state.train_episodes)
+    if leaked:
+        raise SplitError(
+            f"this {state.model} was trained on {len(leaked)} of the episodes to validate it on",
+            where=where,
+            found=", ".join(leaked[:5]) + (", …" if len(leaked) > 5 else ""),
+            remedy=f"train on today's split with `vilp-models train {state.model} --restart`, or restore the split that it was "
+            "trained with",
+        )
 
 
 def checkpoint_digest(run: Path) -> str:

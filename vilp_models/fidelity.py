@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import SplitError, UsageError, nearest
+from vilp_data.errors import UsageError, nearest
 from vilp_data.keys import digest
 from vilp_data.latents import BATCH, encode_batches, latents_path, stale_reason
 from vilp_data.shards import read_shard
 from vilp_data.types import F16, I64, U8
-from vilp_models.checkpoint import checkpoint_digest, read_state, run_for_view
+from vilp_models.checkpoint import checkpoint_digest, read_state, refuse_trained_on_validation, run_for_view
 from vilp_models.lpips import Lpips, load_lpips
 from vilp_models.metrics import lpips_distance, moving_mask, psnr_from_mse, squared_error, temporal_median
 from vilp_models.vqgan import VqganEncoder, load_frame_encoder
@@ -219,7 +219,10 @@ def fidelity_report(
     perceptual = load_lpips("alex")
     measured = []
     for view in views:
-        _refuse_leaks(run_dir, view, episodes)
+        run = run_for_view(run_dir, view)
+        state = read_state(run)
+        assert state is not None  # run_for_view found its checkpoint
+        refuse_trained_on_validation(state, chosen, where=run)
         encoder = load_frame_encoder(run_dir, view)
         perceptual = perceptual.to(encoder.device)
         mean = mean_frame(store, _training_entries(entries, run_dir, view), view)
@@ -269,19 +272,6 @@ def _trained_on(run: Path) -> set[str]:
     state = read_state(run)
     assert state is not None  # run_for_view found its checkpoint
     return set(state.train_episodes)
-
-
-def _refuse_leaks(run_dir: Path, view: str, episodes: Sequence[str]) -> None:
-    """SplitError where validation meets the run's training episodes."""
-    run = run_for_view(run_dir, view)
-    leaked = sorted(set(episodes) & _trained_on(run))
-    if leaked:
-        raise SplitError(
-            f"this VQGAN was trained on {len(leaked)} of the episodes to validate it on",
-            where=run,
-            found=", ".join(leaked[:5]),
-            remedy="train it again on today's split, or restore the split it was trained with",
-        )
 
 
 def _measure_view(

@@ -307,17 +307,16 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
             "condition": "token+concat", "vision_width": 8, "steps": 12, "batch_size": 4, "warmup_steps": 2,
         },
         "cpu": {
-            **_ADAM_SMALL, "width": 48, "multipliers": (1, 2, 4), "blocks": 1, "groups": 16, "convolutions": "factorised",
-            "condition": "token+concat", "vision_width": 16, "steps": 8000, "batch_size": 32, "warmup_steps": 100,
-            "precision": "bf16",
+            **_ADAM_SMALL, "width": 32, "blocks": 1, "groups": 16, "head_size": 32, "condition": "concat", "low_dim": False,
+            "steps": 8000, "batch_size": 32, "warmup_steps": 100, "precision": "bf16",
         },
         "paper": {},
     },
     "policy": {
         "tiny": {**_ADAM_SMALL, "vision_width": 8, "pool": "keypoints", "hidden": (64,), "steps": 12, "batch_size": 8, "warmup_steps": 2},
         "cpu": {
-            **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints",
-            "steps": 4000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
+            **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints", "reconstructed_share": 0.5,
+            "steps": 3000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
         },
         "paper": {},
     },

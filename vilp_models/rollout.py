@@ -1,257 +1,229 @@
-"""Play stored episodes back through their simulator: proof that frames, states and actions belong to their steps.
+"""Closed loop: a policy acts in many environments at once, and each episode becomes a result and, where asked for, a log.
 
-An environment for this is what `make_env` makes, and keeps to a small contract:
+    observe -> plan a chunk of n_action_steps actions -> execute it -> observe …      until done, or `max_steps`
 
-- `reset(seed=..., options={"state": state})` restores a recorded state; the seed is the episode's tag `seed`, if any;
-- its constructor takes the task's `sim.options`, and `cameras=False` for a world that draws no images (replay needs none,
-  and drawing is slow); it is not told `cameras` where images are wanted, so that is its default;
-- observations are dicts that hold the views by name, as uint8 [H,W,3];
-- every info holds "state", float64 [S], laid out like the episode's;
-- its metadata may say `state_names`, `state_periods` (inf where a value does not wrap around), `controlled_state` (the
-  indices that the actions command; others also depend on contacts, and on what a state leaves out) and
-  `replay_tolerance`, in their unit.
+Environments run in lockstep, in batches of `Environments.size`. What comes of a start does not depend on which others run beside
+it, as far as the policy keeps to that: networks round a little differently at another batch size, and contacts amplify it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
 from vilp_data.errors import UsageError
-from vilp_data.sims import register
+from vilp_data.recorder import EpisodeRecorder
+from vilp_data.sims.episode_log import START_NS, TickWriter, tick_writer
 from vilp_data.spec import TaskSpec
-from vilp_data.types import F32, F64, U8, Episode
-from vilp_models.metrics import psnr
+from vilp_data.types import F32, ROLLOUT_TAG
+from vilp_models.environments import Environments, Outcome
+from vilp_models.policies.base import Observation, Policy
+from vilp_models.starts import Start
 
-RENDER_MIN_DB = 40.0
-"""What frames drawn from recorded states score at least against the stored ones; a swapped channel gets 29."""
-
-LISTED_STATES = 8
-"""How many dimensions of the state a report prints; Hanoi has dozens."""
+REWARD_TOPIC = "/rollout/reward"
 
 Progress = Callable[[int, int], None]
-"""Told (steps done, steps in all)."""
+"""Told (environment steps done, in all)."""
 
 
 @dataclass(frozen=True)
-class StateErrors:
-    """How far played states lie from recorded ones: one value for each of S dimensions, in its unit, over all steps."""
+class EpisodeResult:
+    """What one start came to. `max_reward`: the highest reward of any step; `success`: at any step."""
 
-    max_abs: tuple[float, ...]
-    mean_abs: tuple[float, ...]
-
-    def worst(self, dimensions: Sequence[int]) -> float:
-        return max(self.max_abs[i] for i in dimensions)
-
-
-@dataclass(frozen=True)
-class ReplayReport:
-    """What playing an episode's actions gave. `shifted`: the same with each action one step early, which must not pass.
-
-    The proof rests on the `controlled` dimensions; the others show how far the whole simulated episode drifts.
-    """
-
-    episode: str
+    name: str
+    seed: int
+    max_reward: float
+    success: bool
     n_steps: int
-    names: tuple[str, ...]
-    controlled: tuple[int, ...]
-    error: StateErrors
-    shifted: StateErrors
 
-    def proves(self, tolerance: float) -> bool:
-        """Do the recorded states come back within `tolerance`, and would actions one step off have been seen?"""
-        return self.error.worst(self.controlled) <= tolerance < self.shifted.worst(self.controlled)
+
+@dataclass
+class Timing:
+    """Seconds. `plan` is the time within `Policy.act`, of which `parts` are what the policy told; `n_plans` counts its calls,
+    `n_steps` the steps of all environments together."""
+
+    plan: float = 0.0
+    environments: float = 0.0
+    logs: float = 0.0
+    n_plans: int = 0
+    n_steps: int = 0
+    parts: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def steps_per_s(self) -> float:
+        """Environment steps a second of everything together."""
+        total = self.plan + self.environments + self.logs
+        return self.n_steps / total if total else 0.0
 
 
 @dataclass(frozen=True)
-class RenderReport:
-    """How well frames drawn from recorded states match the stored ones: view -> PSNR in dB at each of `steps`.
+class LogPlan:
+    """Where logs go, one `<start's name>.mcap` each, and what their tags say beside task, seed, success and reward."""
 
-    `next_step_db`: the same drawings against the following step's frames, which must not match. Equal frames score 100.
-    """
+    folder: Path
+    tags: Mapping[str, str]
 
-    episode: str
-    steps: tuple[int, ...]
-    psnr_db: Mapping[str, tuple[float, ...]]
-    next_step_db: Mapping[str, tuple[float, ...]]
-
-    def proves(self, minimum_db: float = RENDER_MIN_DB) -> bool:
-        """Does every drawing match its step's frame, and some drawing not match the following one's?"""
-        return all(min(self.psnr_db[view]) >= minimum_db > min(self.next_step_db[view]) for view in self.psnr_db)
+    def path(self, start: Start) -> Path:
+        return self.folder / f"{start.name}.mcap"
 
 
-def make_env(spec: TaskSpec, *, cameras: bool = True) -> Any:
-    """The task's simulator, with or without images in its observations.
+def roll_out(
+    spec: TaskSpec,
+    policy: Policy,
+    starts: Sequence[Start],
+    *,
+    max_steps: int,
+    environments: int,
+    logs: LogPlan | None = None,
+    progress: Progress | None = None,
+) -> tuple[list[EpisodeResult], Timing]:
+    """One episode from every start, at most `environments` at a time; the results in the order of `starts`.
 
-    Raises UsageError where the task names none, its packages are not installed, or it does not take the options."""
-    if spec.sim is None:
-        raise UsageError("this task has no simulator", where=spec.name, remedy="give its TOML a [sim] table with `env`")
-    register()
-    import gymnasium
-
-    options = spec.sim.options if cameras else {**spec.sim.options, "cameras": False}
+    `progress` counts steps, those saved by an early end included. Raises UsageError where the task has no simulator, the
+    simulator does not offer what a policy needs, or the policy gives other than finite actions of its declared shape."""
+    if not starts:
+        raise UsageError("no start to roll out from", where=spec.name, remedy="name some seeds or episodes")
+    results: list[EpisodeResult] = []
+    timing = Timing()
+    world: Environments | None = None
     try:
-        return gymnasium.make(spec.sim.env, **options)
-    except TypeError as error:
-        raise UsageError(
-            f"{spec.sim.env} cannot be made with these options",
-            where=spec.name,
-            found=f"{error} (options {', '.join(sorted(options))})",
-            remedy="its constructor must take the task's sim.options, and the keyword cameras, False where no images are wanted",
-        ) from error
-    except ImportError as error:
-        raise UsageError(f"{spec.sim.env} is not installed", found=str(error), remedy="make setup") from error
-    except gymnasium.error.UnregisteredEnv as error:
-        remedy = "correct sim.env in its TOML"
-        raise UsageError(
-            f"no simulator called {spec.sim.env!r}", where=spec.name, found=error, remedy=remedy
-        ) from error
+        for first in range(0, len(starts), environments):
+            batch = starts[first : first + environments]
+            if world is None or len(world) != len(batch):
+                if world is not None:
+                    world.close()
+                world = Environments(spec, len(batch))
+            run = _Batch(spec, policy, world, batch, timing, logs)
+            told = None if progress is None else _counted(progress, first, len(batch), len(starts), max_steps)
+            results += run.play(max_steps, told)
+    finally:
+        if world is not None:
+            world.close()
+    return results, timing
 
 
-# --- states ---------------------------------------------------------------------------------------------------------
+def _counted(progress: Progress, before: int, size: int, n_starts: int, max_steps: int) -> Callable[[int], None]:
+    """From steps of this batch to steps of all."""
+    return lambda step: progress(before * max_steps + step * size, n_starts * max_steps)
 
 
-def replay(episode: Episode, env: Any, *, progress: Progress | None = None) -> ReplayReport:
-    """Play the episode's actions from its first state and compare every later state; then again one step off.
+class _Batch:
+    """One batch of starts, played to its end."""
 
-    Raises UsageError where the episode lacks actions or states, or has one that is not finite. `progress` counts the
-    steps of both plays: 2 (F - 1) in all.
-    """
-    actions, states = _replayable(episode)
-    n_steps = len(states) - 1
-    periods = np.array(env.metadata.get("state_periods", (np.inf,) * states.shape[1]))
-    seed = int(episode.tags["seed"]) if "seed" in episode.tags else None
-    errors = []
-    for shift in (0, 1):
-        told = None if progress is None else _behind(progress, before=shift * n_steps, total=2 * n_steps)
-        played = play(env, states[0], actions[shift : shift + n_steps], seed=seed, progress=told)
-        errors.append(_compare(played, states[1:], periods))
-    names = env.metadata.get("state_names", tuple(f"state[{i}]" for i in range(states.shape[1])))
-    controlled = env.metadata.get("controlled_state", tuple(range(states.shape[1])))
-    return ReplayReport(episode.id, n_steps, tuple(names), tuple(controlled), *errors)
+    def __init__(
+        self, spec: TaskSpec, policy: Policy, world: Environments, starts: Sequence[Start], timing: Timing,
+        logs: LogPlan | None,
+    ) -> None:  # fmt: skip
+        self.policy, self.world, self.starts, self.timing = policy, world, starts, timing
+        self.max_reward = np.full(len(starts), -np.inf)
+        self.success = np.zeros(len(starts), np.bool_)
+        self.done = np.zeros(len(starts), np.bool_)
+        self.n_steps = np.zeros(len(starts), np.int64)
+        self.logs = None if logs is None else _Logs(spec, world, starts, logs)
 
+    def play(self, max_steps: int, progress: Callable[[int], None] | None) -> list[EpisodeResult]:
+        with ExitStack() as files:
+            began = perf_counter()
+            observation = self.world.reset(self.starts)
+            self.timing.environments += perf_counter() - began
+            self.policy.reset([start.seed for start in self.starts])
+            if self.logs is not None:
+                self.logs.open(files)
+            step = 0
+            while step < max_steps and not self.done.all():
+                chunk = self._plan(observation)
+                for action in chunk.swapaxes(0, 1)[: max_steps - step]:
+                    observation = self._step(action)
+                    step += 1
+                    if progress is not None:
+                        progress(max_steps if self.done.all() else step)
+                    if self.done.all():
+                        break
+            if self.logs is not None:
+                self.logs.finish(self.results())
+        return self.results()
 
-def play(env: Any, state: F64, actions: F32, *, seed: int | None = None, progress: Progress | None = None) -> F64:
-    """The states float64 [k,S] that follow `state` [S] when `actions` [k,A] are taken in turn, past success too."""
-    env.reset(seed=seed, options={"state": state})
-    played = []
-    for action in actions:
-        _, _, _, _, info = env.step(action)
-        played.append(info["state"])
-        if progress is not None:
-            progress(len(played), len(actions))
-    return np.stack(played).astype(np.float64)
+    def results(self) -> list[EpisodeResult]:
+        rows = zip(self.starts, self.max_reward, self.success, self.n_steps, strict=True)
+        return [EpisodeResult(s.name, s.seed, float(reward), bool(won), int(n)) for s, reward, won, n in rows]
 
+    def _plan(self, observation: Observation) -> F32:
+        began = perf_counter()
+        chunk = self.policy.act(observation)
+        self.timing.plan += perf_counter() - began
+        self.timing.n_plans += 1
+        self.timing.parts.update(self.policy.timings())
+        expected = (*observation.hold_action.shape[:1], self.policy.n_action_steps, *observation.hold_action.shape[1:])
+        if chunk.shape != expected or not np.isfinite(chunk).all():
+            finite = "" if chunk.shape != expected else ", not finite"
+            raise UsageError(
+                "the policy gave no actions that can be taken",
+                where=type(self.policy).__name__,
+                found=f"{chunk.shape}{finite}, expected {expected} (environments, actions, action size)",
+                remedy="train it on a dataset of this task, or look for NaN in its checkpoint",
+            )
+        return chunk
 
-def _behind(progress: Progress, *, before: int, total: int) -> Progress:
-    """Progress of a part that follows `before` steps of `total`."""
-    return lambda done, _: progress(before + done, total)
+    def _step(self, action: F32) -> Observation:
+        active = ~self.done
+        if self.logs is not None:
+            began = perf_counter()
+            self.logs.tick(action, active)
+            self.timing.logs += perf_counter() - began
+        began = perf_counter()
+        observation, outcome = self.world.step(action)
+        self.timing.environments += perf_counter() - began
+        self._take_note(outcome, active)
+        return observation
 
-
-def _replayable(episode: Episode) -> tuple[F32, F64]:
-    if episode.action is None or episode.state is None:
-        missing = "actions" if episode.action is None else "simulator states"
-        raise UsageError(f"no {missing} to play back", where=episode.id, remedy="choose an episode that has both")
-    if episode.n_steps < 2:
-        raise UsageError("one step leaves nothing to compare", where=episode.id, remedy="choose a longer episode")
-    finite = np.isfinite(episode.action).all(axis=1) & np.isfinite(episode.state).all(axis=1)
-    if not finite.all():
-        where = f"{episode.id}, step {int(np.argmin(finite))}"
-        raise UsageError(
-            "an action or state is not finite", where=where, remedy="choose an episode without invalid steps"
-        )
-    return episode.action, episode.state
-
-
-def _compare(played: F64, recorded: F64, periods: F64) -> StateErrors:
-    if played.shape != recorded.shape:
-        raise UsageError(
-            "the simulator's state is not laid out like the episode's",
-            found=f"{played.shape[1]} values, recorded {recorded.shape[1]}",
-            remedy="replay with the simulator that recorded it",
-        )
-    difference = played - recorded
-    wraps = np.isfinite(periods)
-    difference[:, wraps] -= periods[wraps] * np.round(difference[:, wraps] / periods[wraps])
-    absolute = np.abs(difference)
-    return StateErrors(tuple(absolute.max(axis=0).tolist()), tuple(absolute.mean(axis=0).tolist()))
-
-
-# --- frames ---------------------------------------------------------------------------------------------------------
-
-
-def render_match(episode: Episode, env: Any, *, every: int = 1, progress: Progress | None = None) -> RenderReport:
-    """Draw the environment at the recorded state of each `every`-th step but the last, and compare with its frames.
-
-    Raises UsageError where the episode has no states, or the environment lacks a view or draws it at another size.
-    """
-    if episode.state is None:
-        raise UsageError("no simulator states to draw", where=episode.id, remedy="choose an episode that has them")
-    steps = range(0, episode.n_steps - 1, every)
-    if not steps:
-        raise UsageError("one step leaves nothing to compare", where=episode.id, remedy="choose a longer episode")
-    seed = int(episode.tags["seed"]) if "seed" in episode.tags else None
-    same: dict[str, list[float]] = {view: [] for view in episode.frames}
-    following: dict[str, list[float]] = {view: [] for view in episode.frames}
-    for done, step in enumerate(steps, start=1):
-        observation, _ = env.reset(seed=seed, options={"state": episode.state[step]})
-        for view, frames in episode.frames.items():
-            drawn = _drawn(observation, view, frames.shape[1:])
-            same[view].append(psnr(drawn, frames[episode.source_index[view][step]]))
-            following[view].append(psnr(drawn, frames[episode.source_index[view][step + 1]]))
-        if progress is not None:
-            progress(done, len(steps))
-    return RenderReport(episode.id, tuple(steps), _frozen(same), _frozen(following))
+    def _take_note(self, outcome: Outcome, active: np.typing.NDArray[np.bool_]) -> None:
+        self.max_reward[active] = np.maximum(self.max_reward, outcome.reward)[active]
+        self.success |= active & outcome.success
+        self.n_steps += active
+        self.timing.n_steps += int(active.sum())
+        self.done |= outcome.done
 
 
-def _drawn(observation: Mapping[str, U8], view: str, shape: tuple[int, ...]) -> U8:
-    remedy = "compare the task's [views] with its [sim]"
-    if view not in observation:
-        raise UsageError(f"the simulator has no view {view!r}", found=", ".join(observation), remedy=remedy)
-    drawn = observation[view]
-    if drawn.shape != shape:
-        raise UsageError(f"view {view!r} has another size", found=f"drawn {drawn.shape}, stored {shape}", remedy=remedy)
-    return drawn
+class _Logs:
+    """The logs of one batch, written tick by tick; they appear when the batch ends."""
 
+    def __init__(self, spec: TaskSpec, world: Environments, starts: Sequence[Start], plan: LogPlan) -> None:
+        self.spec, self.world, self.starts, self.plan = spec, world, starts, plan
+        self.recorders: list[EpisodeRecorder] = []
+        self.writers: list[TickWriter] = [tick_writer(spec, slot.env) for slot in world.slots]
+        self.ticks = np.zeros(len(starts), np.int64)
+        rate_hz = spec.rate_hz or float(world.slots[0].env.metadata.get("render_fps", 10))
+        self.period_ns = round(1e9 / rate_hz)
 
-def _frozen(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...]]:
-    return {view: tuple(row) for view, row in values.items()}
+    def open(self, files: ExitStack) -> None:
+        for start in self.starts:
+            tags = {"task": self.spec.name, **self.plan.tags, "seed": str(start.seed), "start": start.name}
+            recorder = EpisodeRecorder(self.plan.path(start), metadata={**tags, **dict([ROLLOUT_TAG])}, seed=start.seed)
+            self.recorders.append(files.enter_context(recorder))
 
+    def tick(self, actions: F32, active: np.typing.NDArray[np.bool_]) -> None:
+        """What each active environment shows now, and the action it is about to take."""
+        for i in np.flatnonzero(active):
+            self._write(int(i), actions[i])
 
-# --- reports --------------------------------------------------------------------------------------------------------
+    def finish(self, results: Sequence[EpisodeResult]) -> None:
+        """The last tick of each, with the action that keeps still, and what came of it."""
+        for i, (recorder, result) in enumerate(zip(self.recorders, results, strict=True)):
+            self._write(i, np.asarray(self.world.slots[i].info["hold_action"], np.float32))
+            recorder.metadata.update(
+                success=str(result.success).lower(), max_reward=f"{result.max_reward:.6g}", n_steps=str(result.n_steps)
+            )
 
-
-def format_replay(report: ReplayReport, *, tolerance: float | None = None) -> list[str]:
-    """Lines for a terminal: a verdict where there is a tolerance, then the controlled states and the worst others."""
-    worst, worst_shifted = (errors.worst(report.controlled) for errors in (report.error, report.shifted))
-    verdict = "" if tolerance is None else f" ({'within' if report.proves(tolerance) else 'NOT within'} {tolerance:g})"
-    lines = [
-        f"{report.episode}: {report.n_steps} steps replayed, off by at most {worst:.2g}{verdict}; "
-        f"with actions one step early by {worst_shifted:.2g}",
-        f"  {'':<14}{'max':>10}{'mean':>10}{'one early: max':>18}{'mean':>10}",
-    ]
-    order = sorted(range(len(report.names)), key=lambda i: (i not in report.controlled, -report.error.max_abs[i]))
-    for i in order[:LISTED_STATES]:
-        exact = f"{report.error.max_abs[i]:>10.2g}{report.error.mean_abs[i]:>10.2g}"
-        shifted = f"{report.shifted.max_abs[i]:>18.2g}{report.shifted.mean_abs[i]:>10.2g}"
-        lines.append(f"  {report.names[i]:<14}{exact}{shifted}")
-    if len(order) > LISTED_STATES:
-        lines.append(f"  and {len(order) - LISTED_STATES} more")
-    return lines
-
-
-def format_render(report: RenderReport, *, minimum_db: float = RENDER_MIN_DB) -> list[str]:
-    """Lines for a terminal, one a view: verdict, worst and median frame, and the worst when one step off."""
-    lines = []
-    for view, values in report.psnr_db.items():
-        worst = int(np.argmin(values))
-        verdict = "matches" if values[worst] >= minimum_db else "does NOT match"
-        lines.append(
-            f"{report.episode}, {view}: {verdict} at {minimum_db:g} dB: "
-            f"worst {values[worst]:.1f} (step {report.steps[worst]}), median {np.median(values):.1f}; "
-            f"one step off: worst {min(report.next_step_db[view]):.1f}"
-        )
-    return lines
+    def _write(self, i: int, action: F32) -> None:
+        slot, recorder = self.world.slots[i], self.recorders[i]
+        stamp_ns = START_NS + int(self.ticks[i]) * self.period_ns
+        self.writers[i](recorder, stamp_ns, slot.observation, slot.info, action)
+        if self.ticks[i]:
+            recorder.vector(REWARD_TOPIC, stamp_ns, [slot.reward])
+        self.ticks[i] += 1

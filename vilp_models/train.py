@@ -1,53 +1,64 @@
-"""Training: one loop for every model here, and what each model needs to enter it."""
+"""Which runs a model has, what each learns from, and whether it is to be trained, to go on, or to be left alone."""
 
 from __future__ import annotations
 
 import contextlib
-import signal
-import sys
-import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from tqdm import tqdm
 
+from vilp_data.dataset import WindowDataset
+from vilp_data.dataset_split import read_split, side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import BusyError, UsageError, nearest
+from vilp_data.errors import BusyError, StoreError, UsageError, nearest
+from vilp_data.pairs import PairDataset
 from vilp_data.shards import writer_lock
 from vilp_data.spec import TaskSpec
-from vilp_models.checkpoint import (
-    FILE,
-    Arrays,
-    Checkpoint,
-    RunState,
-    load_checkpoint,
-    read_recipe,
-    read_state,
-    run_folder,
-    save_checkpoint,
-)
+from vilp_models.checkpoint import FILE, RunState, read_recipe, read_state, run_folder
+from vilp_models.contract import ContractOf, DataContract
+from vilp_models.curves import FOLDER as CURVES
 from vilp_models.frames import TrainingFrames, open_clips
-from vilp_models.recipe import VqganRecipe
+from vilp_models.model_training import ModelTraining
+from vilp_models.processes import Processes
+from vilp_models.recipe import BcRecipe, PlannerRecipe, PolicyRecipe, TrainingRecipe, VqganRecipe
+from vilp_models.training_loop import Trainee, fit
+from vilp_models.vqgan import VqganEncoder, load_frame_encoder, to_frames
 from vilp_models.vqgan_training import VqganTraining
 
-CHECKPOINT_EVERY_S = 240.0
+
+@dataclass(frozen=True)
+class Run:
+    """One run of one model.
+
+    model     its kind, as in `RunState.model`
+    views     the views it is named after
+    folder    where its checkpoint lies
+    recipe    what it is trained by
+    trainee   makes what the loop trains; called only when there is something to train
+    contract  of the dataset, with statistics over these episodes; None for a model that depends on frames alone
+    built_by  what decides the network besides recipe and contract; as in `RunState.built_by`
+    unit      what its batches hold
+    """
+
+    model: str
+    views: tuple[str, ...]
+    folder: Path
+    recipe: VqganRecipe | TrainingRecipe
+    trainee: Callable[[Processes, DataContract | None], Trainee]
+    contract: ContractOf | None = None
+    built_by: Mapping[str, int] = field(default_factory=dict)
+    unit: str = "samples"
+
+    @property
+    def label(self) -> str:
+        return f"{self.model} {'+'.join(self.views)}"
 
 
-class Trainee(Protocol):
-    """What the loop trains. Step i must depend on i and the saved state alone."""
-
-    def step(self, index: int) -> dict[str, float]:
-        """One optimiser step; its losses by name."""
-        ...
-
-    def save(self) -> tuple[Arrays, Arrays]:
-        """(the model's tensors, the rest of the state)."""
-        ...
-
-    def restore(self, model: Arrays, trainer: Arrays) -> None: ...
+# --- the models ------------------------------------------------------------------------------------------------------
 
 
 def train_vqgan(
@@ -64,10 +75,7 @@ def train_vqgan(
 ) -> list[RunState]:
     """Train one VQGAN a view, or one for all views where the recipe shares it, on frames of `train_episodes` alone.
 
-    A finished run with this recipe is left alone; an unfinished one goes on exactly where it stopped. Returns where each
-    run ended. Raises UsageError where a run in `run_dir` has another recipe, or an unfinished one other episodes
-    (`restart` begins those anew), BusyError where another process trains into it, DivergedError where a loss stops being
-    finite, KeyboardInterrupt on Ctrl-C, saved.
+    Returns where each run ended; see `_bring_to_end` for what is left alone and what is refused.
     """
     store = EpisodeStore(dataset_dir)
     entries = {entry.id: entry for entry in store.index()}
@@ -75,41 +83,230 @@ def train_vqgan(
         if episode not in entries:
             raise UsageError(f"no episode called {episode!r}", where=dataset_dir, remedy=nearest(episode, entries))
     episodes = [entries[episode] for episode in sorted(train_episodes)]
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+
+    def run_of(views: tuple[str, ...]) -> Run:
+        def trainee(processes: Processes, _: DataContract | None) -> Trainee:
+            clips = open_clips(store, episodes, views)
+            frames = TrainingFrames(clips, crop=recipe.crop, crop_moving=recipe.crop_moving)
+            return VqganTraining(recipe, frames, processes)
+
+        return Run("vqgan", views, run_folder(run_dir, views), recipe, trainee, unit="images")
+
     groups = [tuple(sorted(spec.views))] if recipe.share_views else [(view,) for view in sorted(spec.views)]
+    runs = [run_of(views) for views in groups]
+    return _bring_all_to_end(runs, episodes, split_hash, restart=restart, device=device, show=show)
+
+
+def train_planner(
+    dataset_dir: Path,
+    spec: TaskSpec,
+    recipe: PlannerRecipe,
+    run_dir: Path,
+    *,
+    vqgan: Path,
+    restart: bool = False,
+    device: str | None = None,
+    show: bool = True,
+) -> list[RunState]:
+    """Train one planner a view on latents that the VQGAN run `vqgan` made, over windows of `spec.window`.
+
+    Returns and raises as `train_vqgan`; StoreError where latents are missing."""
+    from vilp_models.planner import Planner
+    from vilp_models.planner_clips import planner_clips
+
+    episodes, split_hash = _training_side(dataset_dir)
+    encoders = _encoders(spec, vqgan)
+    keys = {view: encoder.key for view, encoder in encoders.items()}
+
+    def contract(train: Sequence[EpisodeEntry]) -> DataContract:
+        return DataContract.of(dataset_dir, spec, train=train, latent_keys=keys, low_dim=recipe.low_dim, action=False)
+
+    def windows(split: Any) -> WindowDataset:
+        return WindowDataset(dataset_dir, split=split, latent_keys=keys, window=spec.window, with_actions=False)
+
+    def run_of(view: str) -> Run:
+        def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
+            assert agreed is not None
+            try:
+                clips = planner_clips(windows("val"), view, encoders[view], device=processes.device)
+            except StoreError:  # validation may be too little for a window; training can do without pictures
+                clips = None
+            return ModelTraining(
+                recipe, lambda: Planner(recipe, agreed, view), windows("train"), processes, clips=clips
+            )
+
+        return Run("planner", (view,), run_folder(run_dir, (view,)), recipe, trainee, contract, unit="clips")
+
+    runs = [run_of(view) for view in sorted(spec.views)]
+    return _bring_all_to_end(runs, episodes, split_hash, restart=restart, device=device, show=show)
+
+
+def train_policy(
+    dataset_dir: Path,
+    spec: TaskSpec,
+    recipe: PolicyRecipe,
+    run_dir: Path,
+    *,
+    vqgan: Path | None = None,
+    restart: bool = False,
+    device: str | None = None,
+    show: bool = True,
+) -> list[RunState]:
+    """Train the low-level policy of all views together, on pairs of frames (or of latents) of the episodes with actions.
+
+    `vqgan` is the run whose latents it sees, or whose reconstructions it sees some of; other recipes need none. Returns and
+    raises as `train_planner`."""
+    from vilp_models.low_level import LowLevelPolicy
+
+    episodes, split_hash = _training_side(dataset_dir, acting=True)
+    encoders = {}
+    if recipe.sees == "latents" or recipe.reconstructed_share:
+        if vqgan is None:
+            raise UsageError("this policy's recipe needs a VQGAN", where=run_dir, remedy="name its run with --vqgan")
+        encoders = _encoders(spec, vqgan)
+    keys = {view: encoder.key for view, encoder in encoders.items()}
+    views = tuple(sorted(spec.views))
+
+    def contract(train: Sequence[EpisodeEntry]) -> DataContract:
+        return DataContract.of(dataset_dir, spec, train=train, latent_keys=keys, plans=False, low_dim=recipe.low_dim)
+
+    def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
+        assert agreed is not None
+        pairs = PairDataset(
+            dataset_dir,
+            split="train",
+            frame_stride=spec.window.frame_stride,
+            latent_keys=keys,
+            with_frames=recipe.sees == "frames",
+        )
+        codebooks = {view: encoder.model.quantize.embedding.weight.detach() for view, encoder in encoders.items()}
+
+        def reconstruct(view: str, latents: torch.Tensor) -> torch.Tensor:
+            decoded = encoders[view].model.decode(latents.to(encoders[view].device).float()).sample
+            return to_frames(decoded).to(latents.device)
+
+        def build() -> LowLevelPolicy:
+            return LowLevelPolicy(recipe, agreed, codebooks=codebooks, reconstruct=reconstruct)
+
+        return ModelTraining(recipe, build, pairs, processes)
+
+    run = Run("policy", views, run_folder(run_dir, views), recipe, trainee, contract, unit="pairs")
+    return _bring_all_to_end([run], episodes, split_hash, restart=restart, device=device, show=show)
+
+
+def train_bc(
+    dataset_dir: Path,
+    spec: TaskSpec,
+    recipe: BcRecipe,
+    run_dir: Path,
+    *,
+    n_action_steps: int,
+    restart: bool = False,
+    device: str | None = None,
+    show: bool = True,
+) -> list[RunState]:
+    """Train behaviour cloning of all views together: one observation to the next `n_action_steps` actions.
+
+    Returns and raises as `train_vqgan`; UsageError too where a window holds fewer actions than that."""
+    from vilp_models.policies.bc import BcNetwork
+
+    episodes, split_hash = _training_side(dataset_dir, acting=True)
+    views, window = tuple(sorted(spec.views)), spec.window
+    if n_action_steps > window.n_plan_frames * window.frame_stride:
+        raise UsageError(
+            f"n_action_steps = {n_action_steps} is more than a window's actions",
+            where=spec.name,
+            found=f"n_plan_frames = {window.n_plan_frames}, frame_stride = {window.frame_stride}",
+            remedy="lower n_action_steps in [models.vilp], or raise n_plan_frames in [window]",
+        )
+
+    def contract(train: Sequence[EpisodeEntry]) -> DataContract:
+        return DataContract.of(dataset_dir, spec, train=train, low_dim=recipe.low_dim)
+
+    def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
+        assert agreed is not None
+        windows = WindowDataset(dataset_dir, split="train", latent_keys={}, views=views, window=window)
+        return ModelTraining(recipe, lambda: BcNetwork(recipe, agreed, n_action_steps), windows, processes)
+
+    built_by = {"n_action_steps": n_action_steps}
+    run = Run("bc", views, run_folder(run_dir, views), recipe, trainee, contract, built_by, unit="windows")
+    return _bring_all_to_end([run], episodes, split_hash, restart=restart, device=device, show=show)
+
+
+def _training_side(dataset_dir: Path, *, acting: bool = False) -> tuple[list[EpisodeEntry], str]:
+    """Today's training episodes, those with actions where only they serve, and the split's hash."""
+    store = EpisodeStore(dataset_dir)
+    episodes = [entry for entry in side_episodes(store, "train") if entry.has_action or not acting]
+    return episodes, read_split(dataset_dir).hash
+
+
+def _encoders(spec: TaskSpec, vqgan: Path) -> dict[str, VqganEncoder]:
+    return {view: load_frame_encoder(vqgan, view) for view in sorted(spec.views)}
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
+
+
+def _bring_all_to_end(
+    runs: Sequence[Run],
+    episodes: Sequence[EpisodeEntry],
+    split_hash: str,
+    *,
+    restart: bool,
+    device: str | None,
+    show: bool,
+) -> list[RunState]:
     states = []
-    for views in groups:
-        run = run_folder(run_dir, views)
-        wanted = RunState(0, recipe.steps, views, split_hash, {entry.id: entry.key for entry in episodes})
-        with _only_trainer(run):
-            if restart:
-                (run / FILE).unlink(missing_ok=True)
-            states.append(_train_run(store, episodes, recipe, run, wanted, device=device, show=show))
+    for run in runs:
+        processes = Processes(run.recipe.precision, device=device)
+        states.append(_bring_to_end(run, episodes, split_hash, processes, restart=restart, show=show))
+    processes.end()
     return states
 
 
-def _train_run(
-    store: EpisodeStore,
+def _bring_to_end(
+    run: Run,
     episodes: Sequence[EpisodeEntry],
-    recipe: VqganRecipe,
-    run: Path,
-    wanted: RunState,
+    split_hash: str,
+    processes: Processes,
     *,
-    device: str,
+    restart: bool,
     show: bool,
 ) -> RunState:
-    """Bring one run to its end, or leave it alone where it is there."""
-    label, table = f"VQGAN {'+'.join(wanted.views)}", recipe.model_dump(mode="json")
-    earlier = read_state(run)
-    if earlier is not None and not _must_train(run, table, wanted, earlier):
-        if show:
-            print(f"{label}: trained already, {earlier.steps} steps{_unseen(earlier, wanted)}")
-        return earlier
-    clips = open_clips(store, episodes, wanted.views)
-    trainee = VqganTraining(
-        recipe, TrainingFrames(clips, crop=recipe.crop, crop_moving=recipe.crop_moving), device=device
-    )
-    return fit(trainee, run, wanted, table, label=label, rate=Rate("images", recipe.batch_size), show=show)
+    """Train one run to its last step, on these training episodes.
+
+    A finished run with this recipe and contract is left alone; an unfinished one goes on exactly where it stopped. Raises
+    UsageError where the run there has another recipe or contract, or is unfinished and has other episodes (`restart`
+    begins those anew), BusyError where another process trains into it, DivergedError where a loss stops being finite,
+    KeyboardInterrupt on Ctrl-C, saved.
+    """
+    with _only_trainer(run.folder) if processes.is_main else contextlib.nullcontext():
+        if restart and processes.is_main:
+            (run.folder / FILE).unlink(missing_ok=True)
+            shutil.rmtree(run.folder / CURVES, ignore_errors=True)
+        processes.wait()
+        table = run.recipe.model_dump(mode="json")
+        wanted = RunState(
+            step=0,
+            steps=run.recipe.steps,
+            views=run.views,
+            split_hash=split_hash,
+            train_episodes={entry.id: entry.key for entry in episodes},
+            model=run.model,
+            built_by=run.built_by,
+        )
+        earlier = read_state(run.folder)
+        if earlier is not None and not _must_train(run, table, wanted, earlier, episodes):
+            if show and processes.is_main:
+                print(f"{run.label}: trained already, {earlier.steps} steps{_unseen(earlier, wanted)}")
+            return earlier
+        contract = None if run.contract is None else run.contract(episodes)
+        if contract is not None:
+            wanted = replace(wanted, contract=contract.to_json())
+        trainee = run.trainee(processes, contract)
+        return fit(
+            trainee, run.folder, wanted, table, processes, unit=run.unit, per_step=run.recipe.batch_size, show=show
+        )
 
 
 @contextlib.contextmanager
@@ -125,114 +322,39 @@ def _only_trainer(run: Path) -> Iterator[None]:
         yield
 
 
-class Rate:
-    """What the bar counts beside steps: `per_step` of `unit`."""
-
-    def __init__(self, unit: str, per_step: int) -> None:
-        self.unit, self.per_step = unit, per_step
-        self.start_s, self.steps = time.monotonic(), 0
-
-    def per_second(self) -> float:
-        self.steps += 1
-        return self.steps * self.per_step / max(1e-9, time.monotonic() - self.start_s)
-
-
-def _bar(label: str, first: int, steps: int, *, show: bool) -> tqdm[None]:
-    """A bar that moves on a terminal, and twice a minute where its output is kept, as in CI's log."""
-    every_s = 0.1 if sys.stderr.isatty() else 30.0
-    return tqdm(
-        total=steps, initial=first, desc=label, unit="step", disable=not show, mininterval=every_s, maxinterval=every_s
-    )
-
-
-def fit(
-    trainee: Trainee,
-    run: Path,
-    state: RunState,
-    recipe: Mapping[str, Any],
-    *,
-    label: str,
-    rate: Rate,
-    show: bool = True,
-    checkpoint_every_s: float = CHECKPOINT_EVERY_S,
-) -> RunState:
-    """Train to `state.steps`, from the checkpoint in `run` where there is one; save on the way, at the end, on Ctrl-C.
-
-    An error leaves the last checkpoint as it is.
-    """
-    first = 0
-    if read_state(run) is not None:
-        checkpoint = load_checkpoint(run)
-        trainee.restore(checkpoint.model, checkpoint.trainer)
-        first = checkpoint.state.step
-
-    def save(step: int) -> RunState:
-        now = RunState(step, state.steps, state.views, state.split_hash, state.train_episodes)
-        save_checkpoint(run, Checkpoint(*trainee.save(), recipe, now))
-        return now
-
-    saved_s = time.monotonic()
-    with (
-        _stop_on_interrupt() as stop,
-        _bar(label, first, state.steps, show=show) as bar,
-    ):
-        for index in range(first, state.steps):
-            losses = trainee.step(index)
-            shown = {name: f"{loss:.4f}" for name, loss in losses.items()}
-            bar.set_postfix({**shown, f"{rate.unit}/s": f"{rate.per_second():.0f}"}, refresh=False)
-            bar.update()
-            if stop.is_set():
-                save(index + 1)
-                raise KeyboardInterrupt
-            if time.monotonic() - saved_s > checkpoint_every_s:
-                save(index + 1)
-                saved_s = time.monotonic()
-    return save(state.steps)
-
-
-def _must_train(run: Path, recipe: Mapping[str, Any], wanted: RunState, earlier: RunState) -> bool:
-    """Whether the run in this folder is to go on (True) or is fresh (False); UsageError where it is another run."""
-    old = read_recipe(run)
+def _must_train(
+    run: Run, recipe: Mapping[str, Any], wanted: RunState, earlier: RunState, episodes: Sequence[EpisodeEntry]
+) -> bool:
+    """Whether the run in this folder is to go on (True) or is there (False); UsageError where it is another run."""
+    old, recipe = {**read_recipe(run.folder), **earlier.built_by}, {**recipe, **wanted.built_by}
     changed = sorted(key for key in {*recipe, *old} if recipe.get(key) != old.get(key))
     remedy = "train again with --restart, or into another folder"
+    if earlier.model != wanted.model:
+        found = f"{earlier.model} there, {wanted.model} now"
+        raise UsageError("this folder holds a run of another model", where=run.folder, found=found, remedy=remedy)
     if changed:
         found = ", ".join(f"{key} = {old.get(key)!r} there, {recipe.get(key)!r} now" for key in changed)
-        raise UsageError("this run was trained with another recipe", where=run, found=found, remedy=remedy)
+        raise UsageError("this run was trained with another recipe", where=run.folder, found=found, remedy=remedy)
     gone = sorted(
         episode for episode, key in earlier.train_episodes.items() if wanted.train_episodes.get(episode) != key
     )
     if gone:
         raise UsageError(
             f"{len(gone)} episodes this run was trained on changed, or are no training episodes today",
-            where=run,
+            where=run.folder,
             found=", ".join(gone[:5]) + (", …" if len(gone) > 5 else ""),
             remedy=remedy,
         )
     if not earlier.finished and earlier.training_set != wanted.training_set:
-        raise UsageError("this run is unfinished, and training episodes were added since", where=run, remedy=remedy)
+        raise UsageError(
+            "this run is unfinished, and training episodes were added since", where=run.folder, remedy=remedy
+        )
+    if run.contract is not None and earlier.contract is not None:
+        now = run.contract([entry for entry in episodes if entry.id in earlier.train_episodes])
+        DataContract.from_json(earlier.contract).require_same(now, where=run.folder, model=run.model)
     return not earlier.finished
 
 
 def _unseen(earlier: RunState, wanted: RunState) -> str:
     count = len(wanted.train_episodes.keys() - earlier.train_episodes.keys())
     return f"; {count} training episodes came later and were not seen" if count else ""
-
-
-@contextlib.contextmanager
-def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """The first Ctrl-C sets the event, so that a step is never cut in half; a second one interrupts as usual."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def on_interrupt(_number: int, _frame: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, before)
-
-    signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)

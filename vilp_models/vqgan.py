@@ -131,15 +131,19 @@ class VqganEncoder:
         """uint8 [B,H,W,3] to float16 [B,c,h,w], before quantisation."""
         return self.encode_f32(frames, precision=self.precision).astype(np.float16)
 
-    @torch.inference_mode()
     def encode_f32(self, frames: U8, *, precision: Precision = "f32") -> F32:
         """As `encode`, before rounding to float16; computed in float32 unless told otherwise."""
-        self.latent_shape(*frames.shape[1:3])
-        x = to_signed(torch.tensor(frames, device=self.device)).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=precision == "bf16"):
-            z = self.model.encode(x).latents
-        latents: F32 = z.float().contiguous().cpu().numpy()
+        latents: F32 = self.encode_tensor(torch.tensor(frames, device=self.device), precision=precision).cpu().numpy()
         return latents
+
+    @torch.inference_mode()
+    def encode_tensor(self, frames_BHWC: Tensor, *, precision: Precision | None = None) -> Tensor:
+        """uint8 [B,H,W,3] on the encoder's device to float32 [B,c,h,w] there, before quantisation and rounding."""
+        self.latent_shape(*frames_BHWC.shape[1:3])
+        x = to_signed(frames_BHWC).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=(precision or self.precision) == "bf16"):
+            z: Tensor = self.model.encode(x).latents
+        return z.float().contiguous()
 
     @torch.inference_mode()
     def codes_of(self, latents: F16 | F32) -> I64:
@@ -147,11 +151,15 @@ class VqganEncoder:
         z = torch.tensor(latents, device=self.device).float()
         return nearest_codes(z, self.model.quantize.embedding.weight).cpu().numpy()
 
-    @torch.inference_mode()
     def decode(self, latents: F16 | F32) -> U8:
         """[B,c,h,w] before quantisation to uint8 [B,H,W,3]: quantised, then decoded."""
-        z = torch.tensor(latents, device=self.device).float()
-        return to_frames(self.model.decode(z).sample).cpu().numpy()
+        frames: U8 = self.decode_tensor(torch.tensor(latents, device=self.device)).cpu().numpy()
+        return frames
+
+    @torch.inference_mode()
+    def decode_tensor(self, z_BCHW: Tensor) -> Tensor:
+        """`decode` on the encoder's device: latents of any float type to uint8 [B,H,W,3]."""
+        return to_frames(self.model.decode(z_BCHW.float()).sample)
 
 
 def encoder_digest(model: VQModel) -> str:

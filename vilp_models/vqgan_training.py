@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import math
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +12,16 @@ from diffusers import VQModel
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from vilp_data.errors import UsageError, VilpDataError
+from vilp_data.errors import UsageError
+from vilp_data.types import U8
 from vilp_models.checkpoint import Arrays
 from vilp_models.frames import TrainingFrames
 from vilp_models.lpips import MIN_SIDE, load_lpips
+from vilp_models.optimisation import learning_rate, update
+from vilp_models.processes import Processes
 from vilp_models.recipe import VqganRecipe
-from vilp_models.vqgan import build_vqgan, check_divisible, to_signed
+from vilp_models.training_state import arrays_of, load_arrays, load_optimizer, optimizer_arrays, under
+from vilp_models.vqgan import build_vqgan, check_divisible, to_frames, to_signed
 from vilp_models.vqgan_loss import PatchDiscriminator, adaptive_weight, discriminator_loss, weighted_l1
 
 CODEBOOK_BATCHES = 8
@@ -24,9 +29,7 @@ CODEBOOK_BATCHES = 8
 
 K_MEANS_ROUNDS = 10
 
-
-class DivergedError(VilpDataError):
-    """A loss or gradient is no longer a finite number."""
+CLIP_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,14 @@ class VqganTraining:
     restoring between any two steps changes nothing.
     """
 
-    def __init__(self, recipe: VqganRecipe, frames: TrainingFrames, *, device: str | torch.device = "cpu") -> None:
-        self.recipe, self.frames, self.device = recipe, frames, torch.device(device)
+    def __init__(self, recipe: VqganRecipe, frames: TrainingFrames, processes: Processes | None = None) -> None:
+        """Raises UsageError for frames that the network cannot halve, and batches that the processes cannot share evenly."""
+        self.recipe, self.frames = recipe, frames
+        self.processes = processes = processes or Processes(recipe.precision)
+        self.device = processes.device
+        if recipe.batch_size % processes.count:
+            found = f"batch_size = {recipe.batch_size} for {processes.count} processes"
+            raise UsageError("a batch cannot be shared like that", found=found, remedy="batch_size must be a multiple")
         for height, width in frames.sizes():
             _check_size(recipe, height, width)
         with torch.random.fork_rng(devices=[]):
@@ -61,31 +70,43 @@ class VqganTraining:
         if self.discriminator is not None:
             self.optimizers["discriminator"] = Adam(self.discriminator.parameters(), recipe.learning_rate, recipe.betas)
         self.uses = torch.zeros(recipe.codes, dtype=torch.int64, device=self.device)
+        self.waited_s = 0.0
+        self._quantises = False
 
     # --- one step
 
-    def step(self, index: int) -> dict[str, float]:
-        """Do step `index`; its losses. Raises DivergedError where one is not finite, before it reaches the weights."""
+    def step(self, index: int) -> dict[str, Tensor]:
+        """Do step `index`; its losses and gradient norms, as scalars on the device: nothing waits for it."""
         for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(self.recipe, index)
         if index == self.recipe.codebook_start:
             self._fit_codebook()
-        real, moving = self._batch(index)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.precision == "bf16"):
-            out = self._reconstruct(real, quantise=index >= self.recipe.codebook_start)
+        self._quantises = index >= self.recipe.codebook_start
+        real, moving = self._share(*self._batch(index))
+        with self.processes.autocast():
+            out = self._reconstruct(real, quantise=self._quantises)
             losses = self._generator_losses(index, real, out, moving)
-        self._update("generator", torch.stack(list(losses.values())).sum(), list(self.model.parameters()))
+        norm = self._update("generator", torch.stack(list(losses.values())).sum())
+        losses = {name: loss.detach() for name, loss in losses.items()} | {"gradient_norm": norm}
         if self.discriminator is not None and index >= self.recipe.discriminator_start:
-            losses["discriminator"] = self._train_discriminator(real, out.fake.detach())
+            losses |= self._train_discriminator(real, out.fake.detach())
         if out.codes is not None:
             self._count_codes(index, out.codes, out.latents.detach())
-        return {name: loss.item() for name, loss in losses.items()}
+        return losses
 
     def _batch(self, index: int) -> tuple[Tensor, Tensor]:
+        """The batch that all processes share."""
+        started = time.perf_counter()
         frames, moving = self.frames.batch(seed=self.recipe.seed, step=index, size=self.recipe.batch_size)
+        self.waited_s += time.perf_counter() - started
         # The frames cross to the device as bytes.
         return to_signed(torch.from_numpy(frames).to(self.device)), torch.from_numpy(moving).to(self.device)
+
+    def _share(self, real: Tensor, moving: Tensor) -> tuple[Tensor, Tensor]:
+        size = self.recipe.batch_size // self.processes.count
+        mine = slice(self.processes.rank * size, (self.processes.rank + 1) * size)
+        return real[mine], moving[mine]
 
     def _reconstruct(self, real: Tensor, *, quantise: bool) -> Reconstruction:
         z = self.model.encode(real).latents.float()
@@ -112,25 +133,15 @@ class VqganTraining:
         losses["codebook"] = recipe.codebook_weight * out.codebook_loss
         return losses
 
-    def _train_discriminator(self, real: Tensor, fake: Tensor) -> Tensor:
+    def _train_discriminator(self, real: Tensor, fake: Tensor) -> dict[str, Tensor]:
         assert self.discriminator is not None
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.precision == "bf16"):
+        with self.processes.autocast():
             loss = discriminator_loss(self.discriminator(real).float(), self.discriminator(fake).float())
-        self._update("discriminator", loss, list(self.discriminator.parameters()))
-        return loss
+        norm = self._update("discriminator", loss)
+        return {"discriminator": loss.detach(), "discriminator_gradient_norm": norm}
 
-    def _update(self, name: str, loss: Tensor, parameters: list[torch.nn.Parameter]) -> None:
-        optimizer = self.optimizers[name]
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.recipe.clip_norm or math.inf)
-        if not (torch.isfinite(loss) and torch.isfinite(norm)):
-            raise DivergedError(
-                f"the {name}'s loss is no longer finite",
-                found=f"loss {loss.item():g}, gradient norm {norm.item():g}",
-                remedy="lower models.vqgan.learning_rate or set clip_norm; the last checkpoint is kept",
-            )
-        optimizer.step()
+    def _update(self, name: str, loss: Tensor) -> Tensor:
+        return update(self.optimizers[name], loss, clip_norm=self.recipe.clip_norm, processes=self.processes)
 
     # --- the codebook
 
@@ -140,11 +151,13 @@ class VqganTraining:
         latents = [self.model.encode(self._batch(i)[0]).latents for i in range(CODEBOOK_BATCHES)]
         vectors = torch.cat([z.permute(0, 2, 3, 1).flatten(0, 2) for z in latents])
         codes = spread_sample(vectors, self.recipe.codes, self._random(0))
-        self.model.quantize.embedding.weight.copy_(k_means(vectors, codes))
+        embedding = self.model.quantize.embedding.weight
+        embedding.copy_(k_means(vectors, codes))
+        self.processes.copy_from_main([embedding])
 
     @torch.no_grad()
     def _count_codes(self, index: int, codes: Tensor, latents: Tensor) -> None:
-        self.uses += torch.bincount(codes.flatten(), minlength=self.recipe.codes)
+        self.uses += self.processes.total(torch.bincount(codes.flatten(), minlength=self.recipe.codes))
         if not self.recipe.restart_every or (index + 1) % self.recipe.restart_every:
             return
         dead = self.uses == 0
@@ -154,51 +167,43 @@ class VqganTraining:
         for moment in self.optimizers["generator"].state[embedding].values():
             if moment.shape == embedding.shape:  # what Adam remembers of a code that is gone
                 moment[dead] = 0
+        self.processes.copy_from_main([embedding])  # each drew from its own latents
         self.uses.zero_()
 
     def _random(self, index: int) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=self.recipe.seed, counter=[0, 0, 1, index]))
 
+    # --- looking
+
+    @torch.no_grad()
+    def clips(self) -> Mapping[str, U8]:
+        """Images of the first batch, each beside its reconstruction: uint8 [T,H,2W,3]."""
+        real = self._batch(0)[0][:CLIP_FRAMES]
+        fake = self._reconstruct(real, quantise=self._quantises).fake
+        return {"real and reconstructed": to_frames(torch.cat([real, fake], dim=3)).cpu().numpy()}
+
     # --- saving
 
     def save(self) -> tuple[Arrays, Arrays]:
         """(the network's tensors, all else that resuming needs)."""
-        trainer = {"uses": self.uses.cpu().numpy()}
+        trainer = arrays_of({"uses": self.uses})
         if self.discriminator is not None:
-            trainer |= {f"discriminator/{name}": _array(t) for name, t in self.discriminator.state_dict().items()}
+            trainer |= arrays_of(self.discriminator.state_dict(), prefix="discriminator/")
         for name, optimizer in self.optimizers.items():
-            for number, moments in optimizer.state_dict()["state"].items():
-                trainer |= {f"optimizer/{name}/{number}/{key}": _array(value) for key, value in moments.items()}
-        return {name: _array(t) for name, t in self.model.state_dict().items()}, trainer
+            trainer |= optimizer_arrays(optimizer, prefix=f"optimizer/{name}/")
+        return arrays_of(self.model.state_dict()), trainer
 
     def restore(self, model: Arrays, trainer: Arrays) -> None:
         """The inverse of `save`."""
-        self.model.load_state_dict(_tensors(model, self.model))
+        load_arrays(self.model, model)
         self.uses.copy_(torch.from_numpy(trainer["uses"]))
         if self.discriminator is not None:
-            prefix = "discriminator/"
-            own = {name.removeprefix(prefix): array for name, array in trainer.items() if name.startswith(prefix)}
-            self.discriminator.load_state_dict(_tensors(own, self.discriminator))
+            load_arrays(self.discriminator, under("discriminator/", trainer))
         for name, optimizer in self.optimizers.items():
-            prefix = f"optimizer/{name}/"
-            state: dict[int, dict[str, Tensor]] = {}
-            for path, array in trainer.items():
-                if path.startswith(prefix):
-                    number, key = path.removeprefix(prefix).split("/")
-                    state.setdefault(int(number), {})[key] = torch.from_numpy(
-                        array.reshape(()) if key == "step" else array
-                    )
-            optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+            load_optimizer(optimizer, trainer, prefix=f"optimizer/{name}/")
 
-
-def learning_rate(recipe: VqganRecipe, index: int) -> float:
-    """Of step `index`: linear warm-up, then constant, or half a cosine down to zero at the last step."""
-    if index < recipe.warmup_steps:
-        return recipe.learning_rate * (index + 1) / recipe.warmup_steps
-    if recipe.schedule == "constant":
-        return recipe.learning_rate
-    done = (index - recipe.warmup_steps) / max(1, recipe.steps - recipe.warmup_steps)
-    return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * done))
+    def close(self) -> None:
+        """Nothing is read ahead."""
 
 
 def spread_sample(vectors_NC: Tensor, count: int, random: np.random.Generator) -> Tensor:
@@ -235,13 +240,3 @@ def _check_size(recipe: VqganRecipe, height: int, width: int) -> None:
         found=f"{height}x{width}",
         remedy="enlarge models.vqgan.crop, or set models.vqgan.perceptual",
     )
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().contiguous().numpy()
-
-
-def _tensors(arrays: Arrays, like: torch.nn.Module) -> dict[str, Tensor]:
-    """Arrays as tensors, in the module's shapes: files hold no scalars, only vectors of one."""
-    shapes = {name: tensor.shape for name, tensor in like.state_dict().items()}
-    return {name: torch.from_numpy(array.reshape(shapes.get(name, array.shape))) for name, array in arrays.items()}

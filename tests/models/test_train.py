@@ -7,17 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.models.conftest import HEIGHT, WIDTH, tiny_recipe
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, StoreError, UsageError
-from vilp_data.shards import open_shard, write_shard, writer_lock
+from vilp_data.shards import open_shard, read_shard, write_shard, writer_lock
 from vilp_data.spec import TaskSpec
 from vilp_models.checkpoint import FILE, load_checkpoint, model_tensors, read_state, run_folder
+from vilp_models.optimisation import DivergedError
 from vilp_models.recipe import VqganRecipe
 from vilp_models.train import train_vqgan
 from vilp_models.vqgan import load_frame_encoder
-from vilp_models.vqgan_training import DivergedError, VqganTraining
+from vilp_models.vqgan_training import VqganTraining
 
 
 @pytest.fixture
@@ -35,7 +37,7 @@ def _interrupt_at(monkeypatch: pytest.MonkeyPatch, index: int, error: type[Excep
     """Send Ctrl-C, or raise, in the middle of step `index`."""
     step = VqganTraining.step
 
-    def interrupted(self: VqganTraining, at: int) -> dict[str, float]:
+    def interrupted(self: VqganTraining, at: int) -> dict[str, torch.Tensor]:
         if at == index and error is not None:
             raise error("stopped")
         if at == index:
@@ -90,10 +92,17 @@ def test_a_diverging_run_keeps_its_last_checkpoint(
             _train(store, spec, recipe, run_dir)
     run = run_folder(run_dir, ("front", "side"))
     good = (run / FILE).read_bytes()
-    with monkeypatch.context() as patch:
-        _interrupt_at(patch, 4, DivergedError)
-        with pytest.raises(DivergedError):
-            _train(store, spec, recipe, run_dir)
+    step = VqganTraining.step
+
+    def broken(self: VqganTraining, at: int) -> dict[str, torch.Tensor]:
+        if at == 4:
+            with torch.no_grad():
+                self.model.decoder.conv_out.bias[0] = float("nan")
+        return step(self, at)
+
+    monkeypatch.setattr(VqganTraining, "step", broken)
+    with pytest.raises(DivergedError, match=r"front\+side(.|\n)*l1 nan(.|\n)*models.vqgan.learning_rate"):
+        _train(store, spec, recipe, run_dir)
     assert (run / FILE).read_bytes() == good
 
 
@@ -178,3 +187,20 @@ def test_a_checkpoint_of_another_format_or_a_damaged_one_is_refused(
     write_shard(path, {"x": np.zeros(1, np.float32)}, {"format": "vilp-checkpoint-0"})
     with pytest.raises(StoreError, match="vilp-checkpoint-0"):
         load_frame_encoder(run_dir, "front")
+
+
+def test_a_checkpoint_of_before_there_were_other_models_still_loads(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path
+) -> None:
+    _train(store, spec, tiny_recipe(), run_dir)
+    path = run_dir / "front" / FILE
+    shard = read_shard(path)
+    state = json.loads(shard.metadata["state"])
+    for name in ("model", "contract", "built_by"):
+        del state[name]
+    header = {name: shard.metadata[name] for name in ("format", "recipe")} | {"state": json.dumps(state)}
+    key = load_frame_encoder(run_dir, "front").key
+    write_shard(path, dict(shard.arrays), header)
+    assert load_frame_encoder(run_dir, "front").key == key
+    assert (read_state(run_dir / "front") or pytest.fail("no state")).model == "vqgan"
+    _train(store, spec, tiny_recipe(), run_dir)  # and is trained already

@@ -10,9 +10,10 @@ from tests.models.conftest import HEIGHT, WIDTH, card_frames, tiny_recipe
 from vilp_data.errors import UsageError
 from vilp_models.checkpoint import Arrays
 from vilp_models.frames import Clip, TrainingFrames
+from vilp_models.optimisation import learning_rate
 from vilp_models.recipe import VqganRecipe
 from vilp_models.vqgan_loss import PatchDiscriminator, discriminator_loss, weighted_l1
-from vilp_models.vqgan_training import DivergedError, VqganTraining, learning_rate, spread_sample
+from vilp_models.vqgan_training import VqganTraining, spread_sample
 
 
 def _train(
@@ -35,7 +36,7 @@ def test_one_batch_can_be_overfitted() -> None:
     schedule = {"steps": 100, "learning_rate": 5e-3, "schedule": "cosine", "warmup_steps": 10}
     recipe = tiny_recipe(**shape, **schedule, batch_size=1, restart_every=20)
     training = VqganTraining(recipe, card_frames(1))
-    losses = [training.step(index)["l1"] for index in range(recipe.steps)]
+    losses = [training.step(index)["l1"].item() for index in range(recipe.steps)]
     assert losses[-1] < 0.25 * losses[0]
 
 
@@ -47,16 +48,6 @@ def test_stopping_and_resuming_gives_the_same_bits(changes: dict[str, object]) -
     whole = _train(recipe, 6).save()
     half = _train(recipe, 3).save()
     assert _bytes(_train(recipe, 6, saved=half, first=3).save()) == _bytes(whole)
-
-
-def test_losses_that_are_not_finite_stop_before_any_weight_changes() -> None:
-    training = _train(tiny_recipe(), 2)
-    with torch.no_grad():
-        training.model.decoder.conv_out.bias[0] = float("nan")
-    before = _bytes(training.save())
-    with pytest.raises(DivergedError, match="no longer finite"):
-        training.step(2)
-    assert _bytes(training.save()) == before
 
 
 def test_unused_codes_are_moved_onto_what_the_encoder_gives() -> None:

@@ -5,8 +5,9 @@ One `step` holds its action for two control steps of robosuite (20 Hz, the rate 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import mujoco
@@ -26,9 +27,14 @@ from vilp_data.sims.hanoi_scene import (
 )
 from vilp_data.types import F32, F64
 
+if TYPE_CHECKING:
+    from vilp_data.recorder import EpisodeRecorder
+
+BASE_FRAME = "base"
 RATE_HZ = 10
 ON_PEG_RADIUS = 0.010  # a disc on a peg can be 6 mm off centre
 ON_PEG_HEIGHT_ERROR = 0.004
+GRIPPER_OPEN, GRIPPER_CLOSED = -1.0, 1.0
 STEPS_PER_MOVE = 100  # limit of an episode; the expert needs about 45
 _MUJOCO_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_WARMSTART
 
@@ -60,7 +66,8 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
     action       float32 [7]: position delta in m (±0.05), axis-angle delta in rad (±0.5), both in the base frame and from the
                  pose reached so far; gripper -1 open, +1 close
     info         state: float64 [S], all that `reset(options={"state": ...})` needs to go on from here bit for bit;
-                 is_success: bool; proprioception: the samples since the last step, 20 Hz, the newest at this observation
+                 is_success: bool; proprioception: the samples since the last step, 20 Hz, the newest at this observation;
+                 hold_action: float32 [7], no motion and the gripper as it was last told (open, before it was told anything)
     terminated   once all discs lie on the goal peg in order and the gripper has let go
     truncated    after `max_steps` steps
 
@@ -99,6 +106,7 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
         self.action_space = _action_space()
         self.observation_space = _observation_space(height, width, cameras=cameras)
         self._n_steps = 0
+        self._gripper_command = GRIPPER_OPEN
         self._home_quaternion: F64 | None = None
 
     def reset(
@@ -109,6 +117,7 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
         self.scene.base_angle = float(self.np_random.uniform(np.pi / 4, 3 * np.pi / 4))
         self.scene.reset()
         self._n_steps = 0
+        self._gripper_command = GRIPPER_OPEN
         self.scene.refresh_kinematics()
         self._home_quaternion = _ee_quaternion(self.scene)
         if state is not None:
@@ -125,6 +134,7 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
             self.scene.refresh_kinematics()
             samples.append(self._proprioception())
         self._n_steps += 1
+        self._gripper_command = float(command[-1])
         info = self._info(samples)
         success = bool(info["is_success"])
         return self._observation(), float(success), success, self._n_steps >= self.max_steps, info
@@ -148,6 +158,24 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
     @property
     def gripper_names(self) -> list[str]:
         return [name.removeprefix("gripper0_right_") for name in self.scene.robots[0].gripper_joints["right"]]
+
+    def write_tick(
+        self, log: EpisodeRecorder, stamp_ns: int, observation: Mapping[str, Any], info: Mapping[str, Any], action: F32
+    ) -> None:
+        """Write what the task's topics hold at one tick: what was measured since the last one, and the command issued now."""
+        *_, newest = info["proprioception"]
+        for sample in info["proprioception"]:
+            self._write_proprioception(log, stamp_ns + round((sample.time_s - newest.time_s) * 1e9), sample)
+        for view in (name for name in observation if name != "low_dim"):
+            log.image(f"/camera/{view}/image", stamp_ns, observation[view], frame_id=f"camera_{view}")
+        log.vector("/sim/state", stamp_ns, info["state"])
+        log.twist("/action/ee_delta", stamp_ns, action[:3], action[3:6], frame_id=BASE_FRAME)
+        log.joint_state("/action/gripper", stamp_ns, ["gripper"], action[6:])
+
+    def _write_proprioception(self, log: EpisodeRecorder, stamp_ns: int, sample: Proprioception) -> None:
+        log.joint_state("/joint_states", stamp_ns, self.joint_names, sample.joint_position, sample.joint_velocity)
+        log.pose("/ee_pose", stamp_ns, sample.ee_position, sample.ee_quaternion, frame_id=BASE_FRAME)
+        log.joint_state("/gripper/state", stamp_ns, self.gripper_names, sample.gripper_position)
 
     def is_on_peg(self, disc: int, peg: int, level: int) -> bool:
         """Whether `disc` lies flat on `peg` with `level` discs below it."""
@@ -180,7 +208,9 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
             )
         self.scene.place_pegs(float(state[-1]))
         mujoco.mj_setState(model, data, state[:n_physics], _MUJOCO_STATE)
-        self.scene.robots[0].gripper["right"].current_action = state[n_physics : n_physics + 2].copy()
+        ramp = state[n_physics : n_physics + 2].copy()
+        self.scene.robots[0].gripper["right"].current_action = ramp
+        self._gripper_command = GRIPPER_CLOSED if ramp[1] > 0 else GRIPPER_OPEN
 
     def _gripper_ramp(self) -> F64:
         """The finger targets in ±1, moved a fifth per control step; robosuite begins with a single zero for both."""
@@ -195,7 +225,12 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
         return {**images, "low_dim": low_dim}
 
     def _info(self, samples: list[Proprioception]) -> dict[str, Any]:
-        return {"state": self.state(), "is_success": self.is_solved(), "proprioception": tuple(samples)}
+        return {
+            "state": self.state(),
+            "is_success": self.is_solved(),
+            "proprioception": tuple(samples),
+            "hold_action": np.array([0, 0, 0, 0, 0, 0, self._gripper_command], np.float32),
+        }
 
     def _image(self, camera: str) -> Any:
         image = self.scene.sim.render(width=self.width, height=self.height, camera_name=camera)

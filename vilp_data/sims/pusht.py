@@ -34,7 +34,8 @@ class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional
     Action       float32 [2], where the agent is to go, px of 512; in force for 0.1 s (ten steps of a PD controller)
     Reward       covered share of the goal / 0.95, at most 1; an episode ends above 0.95
     Info         "state": float64 [5], px of 512 and radians in [0, 2 pi), in the order of `state_names`;
-                 "is_success": bool; "coverage": float in [0, 1], the covered share of the goal
+                 "is_success": bool; "coverage": float in [0, 1], the covered share of the goal;
+                 "hold_action": float32 [2], the target that keeps the agent where it is
 
     `reset(options={"state": s})` puts the bodies exactly at `s`, at rest. Velocities are not part of the state: a
     demonstration begins at rest, so its first state and its actions give all that follows, but a state from its middle
@@ -114,4 +115,9 @@ class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional
         return {"low_dim": low_dim} | ({"top": self._sim._render()} if self.cameras else {})
 
     def _info(self, coverage: float, *, is_success: bool) -> dict[str, Any]:
-        return {"state": self._sim.get_obs(), "coverage": float(coverage), "is_success": bool(is_success)}
+        return {
+            "state": self._sim.get_obs(),
+            "coverage": float(coverage),
+            "is_success": bool(is_success),
+            "hold_action": np.array(self._sim.agent.position, np.float32),
+        }

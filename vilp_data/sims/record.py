@@ -23,16 +23,15 @@ from typing import TYPE_CHECKING, Any
 from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import EpisodeRecorder
+from vilp_data.sims.episode_log import START_NS
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
-from vilp_data.types import EPISODE_RECORD, F32
+from vilp_data.types import EPISODE_RECORD
 
 if TYPE_CHECKING:
-    from vilp_data.sims.hanoi import HanoiEnv, Proprioception
+    from vilp_data.sims.hanoi import HanoiEnv
 
-START_NS = 1_000_000_000  # simulated clocks begin at one second: some readers take a zero stamp for a missing one
 TICK_NS = 100_000_000
-BASE_FRAME = "base"
 RECORDABLE = ("vilp/Hanoi-v0",)
 
 
@@ -149,12 +148,12 @@ def _record_one(job: _Job) -> RecordedEpisode:
         with EpisodeRecorder(job.path, metadata=_tags(job, env), seed=job.seed) as log:
             tick = 0
             for action in expert.actions():
-                _write_tick(log, env, tick, observation, info, action)
+                env.write_tick(log, START_NS + tick * TICK_NS, observation, info, action)
                 observation, _, terminated, truncated, info = env.step(action)
                 tick += 1
                 if terminated or truncated:
                     break
-            _write_tick(log, env, tick, observation, info, expert.hold())
+            env.write_tick(log, START_NS + tick * TICK_NS, observation, info, expert.hold())
             log.metadata.update(success=str(info["is_success"]).lower(), n_steps=str(tick))
     finally:
         env.close()
@@ -173,22 +172,3 @@ def _tags(job: _Job, env: HanoiEnv) -> dict[str, str]:
         "options": _options_text(job),
         **{f"{name}_version": version(name) for name in ("vilp", "robosuite", "mujoco")},
     }
-
-
-def _write_tick(
-    log: EpisodeRecorder, env: HanoiEnv, tick: int, observation: Mapping[str, Any], info: Mapping[str, Any], action: F32
-) -> None:
-    stamp_ns = START_NS + tick * TICK_NS
-    for sample in info["proprioception"]:
-        _write_proprioception(log, env, START_NS + round(sample.time_s * 1e9), sample)
-    for view in (name for name in observation if name != "low_dim"):
-        log.image(f"/camera/{view}/image", stamp_ns, observation[view], frame_id=f"camera_{view}")
-    log.vector("/sim/state", stamp_ns, info["state"])
-    log.twist("/action/ee_delta", stamp_ns, action[:3], action[3:6], frame_id=BASE_FRAME)
-    log.joint_state("/action/gripper", stamp_ns, ["gripper"], action[6:])
-
-
-def _write_proprioception(log: EpisodeRecorder, env: HanoiEnv, stamp_ns: int, sample: Proprioception) -> None:
-    log.joint_state("/joint_states", stamp_ns, env.joint_names, sample.joint_position, sample.joint_velocity)
-    log.pose("/ee_pose", stamp_ns, sample.ee_position, sample.ee_quaternion, frame_id=BASE_FRAME)
-    log.joint_state("/gripper/state", stamp_ns, env.gripper_names, sample.gripper_position)

@@ -1,0 +1,329 @@
+"""Rollouts: what a start comes to, whoever runs beside it; what is reported, and left behind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium", reason="the simulators are not installed: make setup")
+
+from tests.models.toy_simulator import GOAL, dot_task
+from vilp_data.assemble import assemble_episode
+from vilp_data.dataset_split import find_split, side_episodes, update_split
+from vilp_data.episodes import EpisodeStore
+from vilp_data.errors import UsageError
+from vilp_data.ingest import ingest_logs
+from vilp_data.sources import open_log
+from vilp_data.spec import TaskSpec, load_task
+from vilp_data.types import F32, is_rollout
+from vilp_models.environments import Environments
+from vilp_models.policies.base import Observation
+from vilp_models.policies.recorded import RecordedPolicy
+from vilp_models.policies.stay import StayPolicy
+from vilp_models.rollout import LogPlan, roll_out
+from vilp_models.rollout_report import log_film, read_rollout, roll_out_into
+from vilp_models.starts import Recording, Start, episode_starts, parse_seeds, seed_starts
+
+
+class RandomPolicy:
+    """Random actions, of each environment's own generator."""
+
+    def __init__(self, scale: float = 1.0, n_action_steps: int = 3, size: int = 1, offset: float = 0.0) -> None:
+        self.n_action_steps, self.scale, self.size, self.offset = n_action_steps, scale, size, offset
+        self.tags: Mapping[str, str] = {"random_checkpoint": "abc"}
+        self.seen: list[Observation] = []
+
+    def reset(self, seed: int | Sequence[int]) -> None:
+        seeds = [seed] if isinstance(seed, int) else seed
+        self.generators = [np.random.default_rng(one) for one in seeds]
+        self.seen = []
+
+    def act(self, observation: Observation) -> F32:
+        self.seen.append(observation)
+        shape = (self.n_action_steps, self.size)
+        drawn = [self.offset + generator.uniform(0, self.scale, shape) for generator in self.generators]
+        return np.stack(drawn).astype(np.float32)
+
+    def timings(self) -> Mapping[str, float]:
+        return {"draw": 0.5}
+
+
+@pytest.fixture
+def spec() -> TaskSpec:
+    return dot_task()
+
+
+def test_what_a_start_comes_to_does_not_depend_on_who_runs_beside_it(spec: TaskSpec) -> None:
+    together, _ = roll_out(spec, RandomPolicy(), seed_starts(range(7)), max_steps=20, environments=7)
+    some, _ = roll_out(spec, RandomPolicy(), seed_starts(range(7)), max_steps=20, environments=3)
+    alone, _ = roll_out(spec, RandomPolicy(), seed_starts([5]), max_steps=20, environments=50)
+    assert together == some
+    assert together[5] == alone[0]
+    assert len({result.n_steps for result in together}) > 1  # some were done before others
+
+
+def test_an_episode_ends_at_success_and_counts_the_steps_it_took(spec: TaskSpec) -> None:
+    push = RandomPolicy(scale=1e-9, offset=1.0)
+    (result,), timing = roll_out(spec, push, [Start("s", 0, None, np.array([4.5, 0.0]))], max_steps=20, environments=1)
+    assert (result.success, result.n_steps) == (True, 4)
+    assert result.max_reward == pytest.approx(8.5 / GOAL)
+    assert (timing.n_plans, timing.n_steps) == (2, 4)
+    assert timing.parts["draw"] == 1.0
+
+
+def test_an_episode_that_is_done_stays_as_it_is_while_others_go_on(spec: TaskSpec) -> None:
+    starts = [Start("near", 0, None, np.array([7.5, 0.0])), Start("far", 1, None, np.array([0.0, 0.0]))]
+    near, far = roll_out(spec, RandomPolicy(1e-9, offset=0.5), starts, max_steps=10, environments=2)[0]
+    assert (near.n_steps, far.n_steps) == (1, 10)
+    assert near.max_reward == pytest.approx(1.0)
+    assert not far.success
+
+
+def test_max_steps_cuts_a_chunk_short(spec: TaskSpec) -> None:
+    (result,), timing = roll_out(spec, RandomPolicy(0.0), seed_starts([0]), max_steps=7, environments=1)
+    assert (result.n_steps, timing.n_plans) == (7, 3)
+
+
+def test_the_policy_sees_the_present_and_is_asked_once_a_chunk(spec: TaskSpec) -> None:
+    policy = RandomPolicy(1e-9, offset=0.5)
+    start = Start("s", 0, None, np.array([1.0, 0.0]))
+    roll_out(spec, policy, [start], max_steps=6, environments=1)
+    assert [float(seen.low_dim[0, 0]) for seen in policy.seen] == [1.0, 2.5]
+    assert [int(seen.frames["top"][0, 0, 0, 0]) for seen in policy.seen] == [20, 50]
+    assert policy.seen[0].hold_action.shape == (1, 1)
+
+
+def test_frames_come_at_the_size_the_dataset_stores() -> None:
+    world = Environments(dot_task("options = { height = 16, width = 24 }"), 2)
+    assert world.reset(seed_starts([0, 1])).frames["top"].shape == (2, 8, 12, 3)
+    world.close()
+
+
+@pytest.mark.parametrize("broken", [np.zeros((1, 2, 1), np.float32), np.full((1, 3, 1), np.nan, np.float32)])
+def test_actions_of_another_shape_or_not_finite_are_refused(spec: TaskSpec, broken: F32) -> None:
+    policy = RandomPolicy()
+    policy.act = lambda observation: broken  # type: ignore[method-assign]
+    with pytest.raises(UsageError, match="no actions that can be taken"):
+        roll_out(spec, policy, seed_starts([0]), max_steps=6, environments=1)
+
+
+def test_progress_ends_at_its_total(spec: TaskSpec) -> None:
+    told: list[tuple[int, int]] = []
+    push = RandomPolicy(1e-9, offset=1.0)
+    roll_out(spec, push, seed_starts(range(3)), max_steps=20, environments=2, progress=lambda *at: told.append(at))
+    assert told[-1] == (60, 60)
+    assert told == sorted(told)
+
+
+# --- logs ---
+
+
+def test_a_log_reads_back_as_what_was_seen_and_done(spec: TaskSpec, tmp_path: Path) -> None:
+    plan = LogPlan(tmp_path, {"policy": "random"})
+    results, _ = roll_out(spec, RandomPolicy(), seed_starts([3, 4]), max_steps=20, environments=2, logs=plan)
+    actions = np.random.default_rng(3).uniform(0, 1, (60, 1)).astype(np.float32)
+    with open_log(tmp_path / "seed0000003.mcap") as log:
+        episode = assemble_episode(log, log.episodes()[0], spec, episode_id="three")
+    n_steps = results[0].n_steps
+    assert episode.n_steps == n_steps + 1  # the last tick holds the final observation
+    assert episode.valid.all()
+    assert episode.findings == ()
+    np.testing.assert_array_equal(episode.action[:n_steps], actions[:n_steps])
+    assert float(episode.action[-1, 0]) == 0.0
+    np.testing.assert_allclose(np.diff(episode.state[:, 0]), actions[:n_steps, 0])
+    np.testing.assert_array_equal(episode.low_dim[:, 0], episode.state[:, 0].astype(np.float32))
+    drawn = episode.frames["top"][episode.source_index["top"]][:, 0, 0, 0].astype(int)
+    assert np.abs(drawn - np.floor(episode.state[:, 0] * 20)).max() <= 2  # JPEG
+    tags = episode.tags
+    assert (tags["policy"], tags["source"], tags["success"]) == ("random", "rollout", str(results[0].success).lower())
+    assert float(tags["max_reward"]) == pytest.approx(results[0].max_reward, rel=1e-5)
+
+
+def test_ingest_leaves_a_policys_episodes_out_and_no_side_ever_has_them(spec: TaskSpec, tmp_path: Path) -> None:
+    demonstrations, own = tmp_path / "demonstrations", tmp_path / "own"
+    for folder, seeds in ((demonstrations, range(3)), (own, range(5, 7))):
+        roll_out(
+            spec,
+            RandomPolicy(),
+            seed_starts(seeds),
+            max_steps=20,
+            environments=3,
+            logs=LogPlan(folder, {"policy": "p"}),
+        )
+    root = tmp_path / "data"
+    report = ingest_logs([own], root, spec, workers=1)
+    assert (report.written, report.rollouts) == ([], ["seed0000005", "seed0000006"])
+
+    report = ingest_logs([demonstrations, own], root, spec, workers=1, include_failures=True, with_rollouts=True)
+    assert len(report.written) == 5
+    store = EpisodeStore(root)
+    assert all(is_rollout(entry.tags) for entry in store.index())
+    for path in store.root.glob("episodes/steps/seed000000[012].safetensors"):
+        retag(store, path.name.removesuffix(".safetensors"))
+    update_split(root, ratio=0.6, ratio_from="task", seed=0, group_by=None, strata=(), redraw=False)
+    lock = find_split(root)
+    assert lock is not None
+    assert set(lock.assignment) == {"seed0000000", "seed0000001", "seed0000002"}
+    sides = [entry.id for side in ("train", "val") for entry in side_episodes(store, side)]  # type: ignore[arg-type]
+    assert sorted(sides) == sorted(lock.assignment)
+
+
+def retag(store: EpisodeStore, episode_id: str) -> None:
+    """Make a stored episode a demonstration."""
+    from vilp_data.episodes import Origin
+
+    entry, episode = store.entry(episode_id), store.read(episode_id)
+    origin = Origin(entry.source, entry.source_sha256, entry.source_episode, entry.key, entry.ingest)
+    store.remove_index()
+    store.write(replace(episode, tags={**episode.tags, "source": "person"}), origin)
+    store.write_index()
+
+
+# --- reports ---
+
+
+def stayed(folder: Path, spec: TaskSpec, seeds: range, *, max_steps: int = 20) -> None:
+    roll_out_into(
+        folder, spec, StayPolicy(n_action_steps=4), seed_starts(seeds), name="stay", what="x", max_steps=max_steps,
+        environments=4,
+    )  # fmt: skip
+
+
+def test_a_report_gives_means_intervals_and_the_paired_difference(spec: TaskSpec, tmp_path: Path) -> None:
+    stayed(tmp_path / "stay", spec, range(6))
+    roll_out_into(
+        tmp_path / "random", spec, RandomPolicy(0.5), seed_starts(range(6)), name="random", what="x", max_steps=10,
+        environments=4,
+    )  # fmt: skip
+    with pytest.raises(UsageError, match="another max_steps"):
+        against(tmp_path, spec, range(6), max_steps=10)
+    with pytest.raises(UsageError, match="other starts"):
+        against(tmp_path, spec, range(5), max_steps=20)
+    against(tmp_path, spec, range(6), max_steps=20)
+    table, stay = read_rollout(tmp_path / "random"), read_rollout(tmp_path / "stay")
+    rewards = [episode["max_reward"] for episode in table["episodes"]]
+    difference = np.array(rewards) - [episode["max_reward"] for episode in stay["episodes"]]
+    assert table["max_reward"]["value"] == pytest.approx(np.mean(rewards), abs=1e-4)
+    assert table["max_reward"]["low"] < table["max_reward"]["value"] < table["max_reward"]["high"]
+    (other,) = table["against"]
+    assert other["policy"] == "stay"
+    assert other["max_reward"]["value"] == pytest.approx(difference.mean(), abs=1e-4)
+    assert other["max_reward"]["low"] > 0
+    assert table["tags"] == {"random_checkpoint": "abc"}
+    assert table["time"]["parts_s"] == {"draw": 0.5}
+    page = (tmp_path / "random" / "report.md").read_text()
+    assert "minus `stay`" in page
+
+
+def against(folder: Path, spec: TaskSpec, seeds: range, *, max_steps: int) -> None:
+    roll_out_into(
+        folder / "random", spec, RandomPolicy(0.5), seed_starts(seeds), name="random", what="x", max_steps=max_steps,
+        environments=4, against=[folder / "stay"],
+    )  # fmt: skip
+
+
+def test_a_rollout_leaves_logs_and_three_videos_and_replaces_what_was_there(spec: TaskSpec, tmp_path: Path) -> None:
+    stayed(tmp_path, spec, range(5))
+    assert len(list(tmp_path.glob("logs/*.mcap"))) == 5
+    stayed(tmp_path, spec, range(3))
+    assert sorted(path.stem for path in tmp_path.glob("logs/*.mcap")) == ["seed0000000", "seed0000001", "seed0000002"]
+    assert sorted(path.name for path in tmp_path.glob("videos/*")) == ["best.mp4", "median.mp4", "worst.mp4"]
+    frames, fps = log_film(tmp_path / "logs" / "seed0000000.mcap", spec)
+    assert frames.shape == (21, 8, 12, 3)
+    assert fps == pytest.approx(10)
+
+
+def test_a_rollout_that_is_stopped_leaves_no_report_and_no_half_a_log(spec: TaskSpec, tmp_path: Path) -> None:
+    stayed(tmp_path, spec, range(3))
+
+    class Stopped(RandomPolicy):
+        def act(self, observation: Observation) -> F32:
+            if self.seen:
+                raise KeyboardInterrupt
+            return super().act(observation)
+
+    with pytest.raises(KeyboardInterrupt):
+        roll_out_into(
+            tmp_path, spec, Stopped(), seed_starts(range(3)), name="p", what="x", max_steps=20, environments=3
+        )
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    with pytest.raises(UsageError, match="no finished rollout"):
+        read_rollout(tmp_path)
+
+
+def test_a_single_start_has_no_interval_and_is_still_valid_json(spec: TaskSpec, tmp_path: Path) -> None:
+    stayed(tmp_path, spec, range(1))
+    table = json.loads((tmp_path / "report.json").read_text())
+    assert table["max_reward"]["low"] is None
+
+
+# --- starts ---
+
+
+def test_seeds_are_a_half_open_range_or_one() -> None:
+    assert parse_seeds("100000:100050") == range(100000, 100050)
+    assert parse_seeds("7") == range(7, 8)
+    for wrong in ("", "5:5", "9:3", "a:b", "1:2:3", "-1:4"):
+        with pytest.raises(UsageError, match="no seeds"):
+            parse_seeds(wrong)
+
+
+def test_recorded_actions_lead_from_the_recorded_start_to_the_recorded_end(spec: TaskSpec, tmp_path: Path) -> None:
+    logs = LogPlan(tmp_path / "logs", {})
+    results, _ = roll_out(spec, RandomPolicy(), seed_starts(range(3)), max_steps=20, environments=3, logs=logs)
+    root = tmp_path / "data"
+    ingest_logs([tmp_path / "logs"], root, spec, workers=1, include_failures=True, with_rollouts=True)
+    store = EpisodeStore(root)
+    with pytest.raises(UsageError, match="no episode of 'all'"):
+        episode_starts(store, "all")  # a policy's own are no demonstrations
+    for result in results:
+        retag(store, result.name)
+    starts, recordings = episode_starts(store, "all", limit=2)
+    assert [start.name for start in starts] == ["seed0000000", "seed0000001"]
+    policy = RecordedPolicy(recordings, n_action_steps=4)
+    replayed, _ = roll_out(spec, policy, starts, max_steps=20, environments=2)
+    assert [r.max_reward for r in replayed] == pytest.approx([r.max_reward for r in results[:2]])
+    with pytest.raises(UsageError, match="did you mean 'val'"):
+        episode_starts(store, "vall")
+
+
+def recording(n_steps: int) -> Recording:
+    frames = np.arange(n_steps, dtype=np.uint8)[:, None, None, None] * np.ones((1, 8, 12, 3), np.uint8)
+    steps = np.arange(n_steps, dtype=np.float32)[:, None]
+    return Recording({"top": frames}, {"top": np.arange(n_steps)}, steps, 10 * steps, steps.astype(np.float64))
+
+
+def test_a_recording_holds_its_last_step() -> None:
+    short = recording(3)
+    assert short.frame("top", 1)[0, 0, 0] == 1
+    assert short.frame("top", 9)[0, 0, 0] == 2
+    policy = RecordedPolicy({4: short}, n_action_steps=2)
+    policy.reset([4])
+    seen = Observation({}, np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32))
+    assert [policy.act(seen)[0, :, 0].tolist() for _ in range(2)] == [[0, 10], [20, 20]]
+
+
+# --- Push-T ---
+
+
+@pytest.mark.sim
+def test_pusht_stays_where_it_is_and_its_log_is_a_demonstration_of_that(tmp_path: Path) -> None:
+    pytest.importorskip("gym_pusht", reason="the simulators are not installed: make setup")
+    spec = load_task("pusht")
+    plan = LogPlan(tmp_path, {})
+    policy = StayPolicy(n_action_steps=4)
+    starts = seed_starts([10, 0])
+    together, _ = roll_out(spec, policy, starts, max_steps=6, environments=2, logs=plan)
+    alone, _ = roll_out(spec, policy, starts, max_steps=6, environments=1)
+    assert together == alone
+    assert together[0].max_reward > 0.05  # this start covers a part of the goal
+    with open_log(tmp_path / "seed0000010.mcap") as log:
+        episode = assemble_episode(log, log.episodes()[0], spec, episode_id="ten")
+    assert episode.valid.all()
+    np.testing.assert_allclose(episode.action, episode.low_dim, atol=1e-3)
+    np.testing.assert_array_equal(episode.low_dim, episode.state[:, :2].astype(np.float32))

@@ -1,0 +1,1 @@
+"""What acts in an environment: one file a policy, all of them `base.Policy`."""

@@ -1,0 +1,55 @@
+"""The simulator of a task, and what its environments keep to.
+
+An environment is what `make_env` makes, and keeps to a small contract:
+
+- `reset(seed=..., options={"state": state})` restores a recorded state; the seed is the episode's tag `seed`, if any;
+- its constructor takes the task's `sim.options`, and `cameras=False` for a world that draws no images (replay needs none,
+  and drawing is slow); it is not told `cameras` where images are wanted, so that is its default;
+- observations are dicts that hold the views by name, as uint8 [H,W,3], and "low_dim", float32 [L], as the task's logs have it;
+- every info holds "state", float64 [S], laid out like the episode's;
+- for a policy to act in it (`rollout`), every info also holds "is_success" and "hold_action", float32 [A]: the action that
+  keeps the robot where it is;
+- its metadata may say `state_names`, `state_periods` (inf where a value does not wrap around), `controlled_state` (the
+  indices that the actions command; others also depend on contacts, and on what a state leaves out) and
+  `replay_tolerance`, in their unit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vilp_data.errors import UsageError
+from vilp_data.sims import register
+from vilp_data.spec import SimSpec, TaskSpec
+
+
+def require_simulator(spec: TaskSpec) -> SimSpec:
+    """The task's [sim] table. Raises UsageError where it has none."""
+    if spec.sim is None:
+        raise UsageError("this task has no simulator", where=spec.name, remedy="give its TOML a [sim] table with `env`")
+    return spec.sim
+
+
+def make_env(spec: TaskSpec, *, cameras: bool = True) -> Any:
+    """The task's simulator, with or without images in its observations.
+
+    Raises UsageError where the task names none, its packages are not installed, or it does not take the options."""
+    sim = require_simulator(spec)
+    register()
+    import gymnasium
+
+    options = sim.options if cameras else {**sim.options, "cameras": False}
+    try:
+        return gymnasium.make(sim.env, **options)
+    except TypeError as error:
+        raise UsageError(
+            f"{sim.env} cannot be made with these options",
+            where=spec.name,
+            found=f"{error} (options {', '.join(sorted(options))})",
+            remedy="its constructor must take the task's sim.options, and the keyword cameras, False where no images are wanted",
+        ) from error
+    except ImportError as error:
+        raise UsageError(f"{sim.env} is not installed", found=str(error), remedy="make setup") from error
+    except gymnasium.error.UnregisteredEnv as error:
+        remedy = "correct sim.env in its TOML"
+        raise UsageError(f"no simulator called {sim.env!r}", where=spec.name, found=error, remedy=remedy) from error

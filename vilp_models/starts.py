@@ -1,0 +1,120 @@
+"""Where episodes begin: at what the simulator draws from a seed, or at the first state of a recorded episode."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vilp_data.dataset_split import side_episodes
+from vilp_data.episode_files import open_frames, open_steps
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
+from vilp_data.errors import UsageError, nearest
+from vilp_data.types import F32, F64, I32, U8, is_rollout
+
+SIDES = ("val", "train", "all")
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where an episode begins. `name` tells it from others and names its files; `seed` is the policy's.
+
+    reset_seed  the environment's, where it draws its own start
+    state       float64 [S]: the recorded state to begin at instead
+    """
+
+    name: str
+    seed: int
+    reset_seed: int | None
+    state: F64 | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A stored episode to look ahead in: mapped frames view -> uint8 [n,H,W,3], source_index view -> int32 [F], low_dim float32
+    [F,L], action float32 [F,A], state float64 [F,S]. Past the end the last step repeats."""
+
+    frames: Mapping[str, U8]
+    source_index: Mapping[str, I32]
+    low_dim: F32
+    action: F32
+    state: F64
+
+    @property
+    def n_steps(self) -> int:
+        return len(self.action)
+
+    def held(self, step: int) -> int:
+        """`step`, or the last one."""
+        return min(step, self.n_steps - 1)
+
+    def frame(self, view: str, step: int) -> U8:
+        """uint8 [H,W,3]: what the view showed at `step`."""
+        frame: U8 = self.frames[view][self.source_index[view][self.held(step)]]
+        return frame
+
+
+def parse_seeds(text: str) -> range:
+    """ "100000:100050" is 100000 … 100049, "7" is 7 alone. Raises UsageError for anything else, or a range without a seed."""
+    match = re.fullmatch(r"(\d+)(?::(\d+))?", text)
+    first, end = (int(match[1]), int(match[2] or int(match[1]) + 1)) if match else (0, 0)
+    if end <= first:
+        remedy = "FIRST:END, without END itself, as 100000:100050 for fifty seeds; or one seed"
+        raise UsageError(f"no seeds: {text!r}", remedy=remedy)
+    return range(first, end)
+
+
+def seed_starts(seeds: Sequence[int]) -> list[Start]:
+    """A start for each seed, which is the simulator's and the policy's."""
+    return [Start(f"seed{seed:07d}", seed, seed) for seed in seeds]
+
+
+def episode_starts(
+    store: EpisodeStore, side: str, *, limit: int | None = None
+) -> tuple[list[Start], dict[int, Recording]]:
+    """The first recorded state of each stored episode on a side of the split ("val", "train", or "all" there are), the first
+    `limit` of them by id; and the recordings, by the start's seed: the episode's number in the dataset.
+
+    Raises UsageError for an unknown side, where no such episode has actions and simulator states, or where one begins with a step
+    that cannot be used; SplitError where the dataset has no split."""
+    if side not in SIDES:
+        raise UsageError(f"no such side of the split: {side!r}", remedy=nearest(side, SIDES))
+    index = store.index()
+    numbers = {entry.id: number for number, entry in enumerate(index)}
+    entries = index if side == "all" else side_episodes(store, "val" if side == "val" else "train")
+    played = [entry for entry in entries if entry.has_action and entry.has_state and not is_rollout(entry.tags)][:limit]
+    if not played:
+        raise UsageError(
+            f"no episode of {side!r} has both actions and simulator states",
+            where=store.root,
+            remedy="roll out from --seeds instead",
+        )
+    recordings = {numbers[entry.id]: open_recording(store, entry) for entry in played}
+    starts = [
+        Start(
+            entry.id,
+            numbers[entry.id],
+            int(entry.tags["seed"]) if "seed" in entry.tags else None,
+            np.array(recordings[numbers[entry.id]].state[0], np.float64),
+        )
+        for entry in played
+    ]
+    return starts, recordings
+
+
+def open_recording(store: EpisodeStore, entry: EpisodeEntry) -> Recording:
+    """One stored episode, its frames mapped. Raises UsageError where its first step cannot be used, StoreError for damage."""
+    views = sorted(entry.frames_sha256)
+    steps = open_steps(store, entry, views)
+    if not (np.isfinite(steps["state"][0]).all() and steps["valid"][0]):
+        remedy = "leave it out, or roll out from --seeds"
+        raise UsageError("its first step is not valid, so nothing can begin there", where=entry.id, remedy=remedy)
+    return Recording(
+        frames={view: open_frames(store, entry, view) for view in views},
+        source_index={view: np.array(steps[f"source_index/{view}"]) for view in views},
+        low_dim=np.array(steps["low_dim"]),
+        action=np.array(steps["action"]),
+        state=np.array(steps["state"]),
+    )
