@@ -17,7 +17,7 @@ import torch
 
 from vilp_models.contract import DataContract
 from vilp_models.low_level import LowLevelPolicy
-from vilp_models.planner import Planner
+from vilp_models.planner import Condition, Planner
 from vilp_models.policies.base import Observation
 from vilp_models.policies.vilp import VilpPolicy
 from vilp_models.recipe import PlannerRecipe, PolicyRecipe, VqganRecipe
@@ -37,7 +37,7 @@ class PlainPlanner(Planner):
 
     def condition(self, frames, present_latents, low_dim):
         self.plain_context = self.context(frames, low_dim)
-        return super().condition(frames, present_latents, low_dim)
+        return Condition([], None, None)
 
 
 def plain(planner: Planner) -> Planner:
@@ -97,7 +97,7 @@ def main() -> None:
         observation = Observation({VIEW: frames}, np.zeros((1, 0), np.float32), np.zeros((1, 2), np.float32))
         from_frames = LowLevelPolicy(PolicyRecipe(), made_for)
         codebooks = {VIEW: model.quantize.embedding.weight}
-        from_latents = LowLevelPolicy(PolicyRecipe(sees="latents", vision_width=32), made_for, codebooks=codebooks)
+        from_latents = LowLevelPolicy(PolicyRecipe(sees="latents"), made_for, codebooks=codebooks)
         policies = {
             "plainly": VilpPolicy(
                 {VIEW: plain(planner)}, {VIEW: encoder}, from_frames, n_action_steps=n_actions, decode_all=True

@@ -58,7 +58,7 @@ def write_split(root: Path, *, ratio: float = 0.5) -> None:
 def add_episodes(root: Path, *episodes: Episode) -> None:
     store = EpisodeStore(root)
     for one in episodes:
-        store.write(one, Origin("test", "", one.id, "", {}))
+        store.write(one, Origin("test", "", one.id, f"key of {one.id}", {}))
     store.write_index()
 
 

@@ -14,7 +14,7 @@ from tests.stored_episodes import KEYS, VIEWS, add_episodes, episode, write_data
 from vilp_data import shards
 from vilp_data.dataset import WindowDataset, WindowTensors
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import SplitError, StoreError, UsageError
+from vilp_data.errors import NoWindowError, SplitError, StoreError, UsageError
 from vilp_data.latents import latents_path
 from vilp_data.spec import WindowSpec
 from vilp_data.split_lock import Side, SplitLock, assignment_hash
@@ -302,3 +302,15 @@ def assert_equal(a: WindowTensors, b: WindowTensors) -> None:
             assert torch.equal(tensor, getattr(b, name)[view])
     for name in ("latent_mask", "low_dim", "action", "action_mask", "episode", "step"):
         assert torch.equal(getattr(a, name), getattr(b, name))
+
+
+def test_only_episodes_with_actions_where_a_model_learns_actions(root: Path) -> None:
+    assert opened(root).episode_ids == ["a", "b", "c", "d"]
+    dataset = opened(root, acting=True)
+    assert dataset.episode_ids == ["a", "c", "d"]
+    batch = dataset.read(range(len(dataset)))
+    assert set(batch.episode.tolist()) == {0, 1, 2}
+    assert batch.action_mask[:, 0].all()
+    write_dataset(root / "mute", episode("b", 9, with_action=False))
+    with pytest.raises(NoWindowError, match="no window fits"):
+        opened(root / "mute", acting=True)

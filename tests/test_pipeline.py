@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,14 @@ def make(*words: str) -> str:
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout
+
+
+def run_data(*words: str) -> str:
+    """Run `vilp-data`; what it says."""
+    ended = subprocess.run(
+        [str(Path(sys.executable).with_name("vilp-data")), *words], capture_output=True, text=True, check=False
+    )
+    return ended.stdout + ended.stderr
 
 
 def latent_keys(root: Path) -> dict[str, str]:
@@ -59,6 +69,32 @@ def test_make_latents_walks_from_nothing_to_windows_of_latents_and_then_has_noth
     assert tree(tmp_path) == before
 
     assert "off by at most 0 (within 1e-06)" in make("replay", "TASK=hanoi", "PRESET=tiny", f"DATA={tmp_path}")
+
+
+@pytest.mark.sim
+def test_make_rollout_trains_every_model_and_lets_them_act(tmp_path: Path) -> None:
+    """Two views and low_dim, a handful of steps each: nothing is learnt, and everything runs."""
+    pytest.importorskip("robosuite", reason="the simulators are not installed: make setup")
+    words = ["TASK=hanoi", "PRESET=tiny", "SEEDS=0:1", f"DATA={tmp_path}"]
+    told = make("rollout", "bc", "generate", *words)
+    assert "do not act on this planner" in told  # it is compared with copying, and loses, and that is said
+    for run in ("planner-tiny/front", "planner-tiny/side", "policy-tiny/front+side", "bc-tiny/front+side"):
+        assert (tmp_path / "runs" / run / "checkpoint.safetensors").is_file()
+    assert (tmp_path / "runs" / "planner-tiny" / "evaluation" / "sheet.png").is_file()
+
+    report = json.loads((tmp_path / "rollouts" / "vilp-tiny-0-1" / "report.json").read_text())
+    assert report["episodes"][0]["n_steps"] == 100
+    assert set(report["time"]["parts_s"]) == {"encode", "condition", "denoise", "decode", "act"}
+    assert [other["policy"] for other in report["against"]] == ["stay"]
+    assert list((tmp_path / "rollouts" / "vilp-tiny-0-1" / "videos").glob("*.mp4"))
+    for kind in ("mp4", "png", "rrd"):
+        assert list((tmp_path / "generated" / "planner-tiny").rglob(f"*.{kind}"))
+
+    log = next((tmp_path / "rollouts" / "vilp-tiny-0-1" / "logs").glob("*.mcap"))
+    assert "1 rollout of a policy left out" in run_data(
+        "ingest", str(log), "--into", str(tmp_path), "--task", "hanoi", "--preset", "tiny"
+    )
+    assert "trained already" in make("policy", *words)
 
 
 @pytest.mark.slow

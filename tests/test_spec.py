@@ -27,6 +27,8 @@ def test_every_built_in_task_is_valid_under_every_preset(task: str, preset: str 
         ("[split]\nratio = 1.5", "split.ratio"),
         ("[action.a]\ntopic = '/c'\nfrom = 'arm'", "exactly one of"),
         ("[action.a]\nfrom = 'arm'", "no low_dim part"),
+        ("[action.a]\ntopic = '/c'\nholds = 'arm'", "holds = 'arm' is no low_dim part"),
+        ("[low_dim.arm]\ntopic = '/d'\n[action.a]\ntopic = '/c'\nkind = 'delta'\nholds = 'arm'", "absolute commands"),
         ("[action.a]\ntopic = '/c'\nkind = 'delta_rotation'", "composes differently"),
         ("[low_dim.a]\ntopic = '/a'\nclock = 'log'", "read by two clocks"),
         ("[presets.cppu]", "did you mean 'cpu'"),
@@ -65,4 +67,7 @@ def test_the_order_of_an_action_s_parts_is_part_of_the_ingest_fields() -> None:
 def test_what_does_not_touch_the_stored_bytes_is_not_part_of_the_ingest_fields() -> None:
     changed = parse_task(GOOD + "[split]\nratio = 0.5\n[window]\nn_plan_frames = 3", where="x").ingest_fields()
     assert changed == parse_task(GOOD, where="x").ingest_fields()
+    parts = "[low_dim.arm]\ntopic = '/d'\n[action.a]\ntopic = '/c'\n"
+    held = parse_task(GOOD + parts + "holds = 'arm'", where="x").ingest_fields()
+    assert held == parse_task(GOOD + parts, where="x").ingest_fields()
     assert changed != parse_task(GOOD.replace("height = 8", "height = 16"), where="x").ingest_fields()

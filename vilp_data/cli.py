@@ -140,7 +140,8 @@ def ingest(
     into: Annotated[Path | None, typer.Option(help="Dataset folder. Default: data/TASK.", show_default=False)] = None,
     include_failures: Annotated[bool, typer.Option(help="Take episodes tagged as failures too.")] = False,
     with_rollouts: Annotated[
-        bool, typer.Option("--with-rollouts", help="Take episodes that a policy made too; no model trains on them.")
+        bool,
+        typer.Option("--with-rollouts", help="Store a policy's own episodes too: they never get a side of the split."),
     ] = False,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
@@ -172,7 +173,8 @@ def ingest(
             + (f", {len(report.failed)} could not be read" if report.failed else "")
         )
         if report.rollouts:
-            print(f"  {len(report.rollouts)} rollouts of a policy left out; --with-rollouts takes them")
+            many = "1 rollout" if len(report.rollouts) == 1 else f"{len(report.rollouts)} rollouts"
+            print(f"  {many} of a policy left out; --with-rollouts stores what no model will learn from")
         if report.replaced:
             print(f"  replaced, since their log changed: {', '.join(report.replaced)}")
         if report.passed_over:

@@ -19,7 +19,7 @@ from vilp_data import windows
 from vilp_data.batches import TensorBatch, allocated
 from vilp_data.dataset_split import side_episodes
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import StoreError
+from vilp_data.errors import NoWindowError
 from vilp_data.open_episodes import OpenEpisodes, valid_runs
 from vilp_data.spec import WindowSpec
 from vilp_data.types import I64
@@ -67,16 +67,18 @@ class WindowDataset(Dataset[WindowTensors]):
         views: Sequence[str] | None = None,
         with_frames: bool = True,
         with_actions: bool = True,
+        acting: bool = False,
     ) -> None:
         """Open the dataset at `root`. `latent_keys` names the encoder key of each view whose latents are read, `views` those
-        whose images are: the same ones for None.
+        whose images are: the same ones for None. `acting` leaves out the episodes without actions.
 
-        Raises SplitError without a split that covers the episodes, and StoreError where no window fits. What else is refused,
+        Raises SplitError without a split that covers the episodes, and NoWindowError where no window fits. What else is refused,
         and when, `open_episodes.OpenEpisodes` says.
         """
         store = EpisodeStore(Path(root))
         self._window = window
-        self._entries = store.index() if split == "all" else side_episodes(store, split)
+        entries = store.index() if split == "all" else side_episodes(store, split)
+        self._entries = [entry for entry in entries if entry.has_action or not acting]
         self._n_steps = np.array([entry.n_steps for entry in self._entries], np.int64)
         self._has_action = np.array([entry.has_action and with_actions for entry in self._entries], np.bool_)
         frame_views = tuple(latent_keys) if views is None else tuple(views)
@@ -97,7 +99,7 @@ class WindowDataset(Dataset[WindowTensors]):
         )
         self._index = windows.WindowIndex.of(episode, starts)
         if not len(self._index):
-            raise StoreError(
+            raise NoWindowError(
                 "no window fits any episode",
                 where=store.root,
                 found=f"{len(self._entries)} episodes of at most {self._n_steps.max(initial=0)} steps",

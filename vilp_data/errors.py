@@ -61,6 +61,10 @@ class StoreError(VilpDataError):
     """A stored file that is missing, damaged, of another format version, or cannot be written."""
 
 
+class NoWindowError(StoreError):
+    """Episodes that are all too short, or too much interrupted, for one window. Nothing is damaged."""
+
+
 class BusyError(VilpDataError):
     """Another process is writing this dataset."""
 

@@ -45,8 +45,10 @@ class EncodedDataset:
         return self.frames_per_s / self.bare_frames_per_s if self.bare_frames_per_s else 0.0
 
 
-def find_run(root: Path, given: Path | None, encoder_name: str) -> Path:
-    """The folder of the trained encoder: the one given, else the only `runs/<encoder_name>*` of the dataset."""
+def find_run(root: Path, given: Path | None, encoder_name: str, *, option: str = "--run") -> Path:
+    """The folder of the trained encoder: the one given, else the only `runs/<encoder_name>*` of the dataset.
+
+    `option` is how a user names one. Raises UsageError where there is no such folder, or it is not clear which."""
     if given is not None:
         if not given.is_dir():
             raise UsageError(
@@ -60,7 +62,7 @@ def find_run(root: Path, given: Path | None, encoder_name: str) -> Path:
             f"which {encoder_name} run?",
             where=root / "runs",
             found=there,
-            remedy=f"name one with --run, or train one with `vilp-models train {encoder_name}`",
+            remedy=f"name one with {option}, or train one with `vilp-models train {encoder_name}`",
         )
     return runs[0]
 

@@ -62,6 +62,8 @@ class ActionSpec(Frozen):
     kind "delta": commands issued in the interval summed, zero where there was none; never held
     kind "delta_rotation": axis-angle vectors in radians, composed as rotations over the interval; `frame` says in which order:
                  "base" and "world" (fixed) or "tool" (moving with the tool)
+    holds        of absolute commands: the low_dim part that, given as a command, keeps the robot where it is. Decides nothing in
+                 ingested files
     """
 
     topic: str | None = None
@@ -74,6 +76,7 @@ class ActionSpec(Frozen):
     frame: str = ""
     from_: str | None = Field(default=None, alias="from")
     shift: int = Field(default=1, ge=1)
+    holds: str | None = None
 
     @model_validator(mode="after")
     def _one_origin(self) -> Self:
@@ -87,6 +90,8 @@ class ActionSpec(Frozen):
             )
         if self.from_ is not None and self.kind != "absolute":
             raise ValueError(f"`from = {self.from_!r}` gives absolute targets, but kind = {self.kind!r}")
+        if self.holds is not None and self.kind != "absolute":
+            raise ValueError(f"`holds = {self.holds!r}` is of absolute commands, but kind = {self.kind!r}")
         return self
 
 
@@ -144,10 +149,11 @@ class TaskSpec(Frozen):
     @model_validator(mode="after")
     def _names_fit(self) -> Self:
         for part, spec in self.action.items():
-            if spec.from_ is not None and spec.from_ not in self.low_dim:
-                raise ValueError(
-                    f"action.{part}: from = {spec.from_!r} is no low_dim part; {nearest(spec.from_, self.low_dim)}"
-                )
+            for key, named in (("from", spec.from_), ("holds", spec.holds)):
+                if named is not None and named not in self.low_dim:
+                    raise ValueError(
+                        f"action.{part}: {key} = {named!r} is no low_dim part; {nearest(named, self.low_dim)}"
+                    )
         topics = [view.topic for view in self.views.values()]
         if twice := {topic for topic in topics if topics.count(topic) > 1}:
             raise ValueError(f"two views read topic {min(twice)!r}; a topic is one view")
@@ -190,6 +196,8 @@ class TaskSpec(Frozen):
         fields = self.model_dump(mode="json", by_alias=True, include={"rate_hz", "views", "low_dim", "action", "state"})
         for vector in ("low_dim", "action"):
             fields[vector] = [{"part": name, **table} for name, table in fields[vector].items()]
+        for part in fields["action"]:
+            del part["holds"]
         return fields
 
 

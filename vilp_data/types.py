@@ -38,7 +38,8 @@ ROLLOUT_TAG = ("source", "rollout")
 
 
 def is_rollout(tags: Mapping[str, str]) -> bool:
-    """Whether these are the tags of a policy's own episode, which no model is to learn from unless someone asks for that."""
+    """Whether these are the tags of a policy's own episode: it may be stored and viewed, but never gets a side of the split, so no
+    model learns from it or is judged by it."""
     name, value = ROLLOUT_TAG
     return tags.get(name) == value
 

@@ -84,7 +84,8 @@ def run_for_view(run_dir: Path, view: str) -> Path:
         if view in run.name.split("+"):
             return run
     known = [name for run in runs for name in run.name.split("+")]
-    remedy = nearest(view, known) if known else "train one with `vilp-models train vqgan`"
+    train = "train one with `vilp-models train vqgan`"
+    remedy = f"{nearest(view, known)}; or {train}" if known else train
     raise UsageError(f"no trained network for view {view!r}", where=run_dir, remedy=remedy)
 
 
@@ -152,8 +153,10 @@ def load_run(run: Path, kind: str, *, unfinished: bool = False) -> TrainedRun:
 
 
 def refuse_trained_on_validation(state: RunState, val: Sequence[EpisodeEntry], *, where: Path) -> None:
-    """Raise SplitError where the run in `where` was trained on one of these episodes: it knows what it would be judged on."""
-    leaked = sorted(entry.id for entry in val if entry.id in state.train_episodes)
+    """Raise SplitError where the run in `where` was trained on one of these episodes, by whatever name: it knows what it would be
+    judged on."""
+    learnt = set(state.train_episodes.values())
+    leaked = sorted(entry.id for entry in val if entry.id in state.train_episodes or entry.key in learnt)
     if leaked:
         raise SplitError(
             f"this {state.model} was trained on {len(leaked)} of the episodes to validate it on",

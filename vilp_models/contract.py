@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -35,14 +35,17 @@ stays in its own unit: dividing by its true one would not end, or blow up the fi
 
 @dataclass(frozen=True)
 class DataContract:
-    """What of a dataset a model depends on. What a model does not use is empty or 0, and then decides nothing.
+    """What of a dataset a model depends on. What a model does not use is empty, 0 or None, and then decides nothing.
 
     task           the task's name
     views          cameras, sorted
     geometry       view -> (height, width, fit) of stored frames; fit is "" where the spec states none
     rate_hz        of the control clock
     frame_stride   (paper Δt) steps between planned frames, or between the two frames of a pair
-    n_plan_frames  (paper N); 0 for a model of pairs
+    n_plan_frames  (paper N); 0 for a model of pairs, and for behaviour cloning, whose windows are as long as its chunks
+    max_goal_frames
+                   how far past the end planned frames may repeat the last one, which decides where windows begin; None like
+                   n_plan_frames = 0, and in checkpoints of before it was recorded: then it is not compared
     latent_keys    view -> key of the encoder that made the latents; {} for models that see frames alone
     latent_shapes  view -> (c, h, w)
     low_dim        the parts of low_dim in the order of its columns, as in `TaskSpec.ingest_fields`; low_dim_size: columns
@@ -56,6 +59,7 @@ class DataContract:
     rate_hz: float
     frame_stride: int
     n_plan_frames: int = 0
+    max_goal_frames: int | None = None
     latent_keys: Mapping[str, str] = field(default_factory=dict)
     latent_shapes: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     low_dim: Fields = ()
@@ -80,10 +84,10 @@ class DataContract:
         """Of the dataset at `root` as it is now; statistics over the episodes `train` alone, which must not be empty.
 
         `spec` is the dataset's; `window` outranks its own. `latent_keys` names the encoder of each view whose latents are
-        used. `plans` False is a model of pairs, for which n_plan_frames decides nothing; without `low_dim` or `action`
-        the model never sees them. Low_dim counts valid steps alone, actions those of episodes that have them. Raises
-        UsageError without training episodes, or without actions where they are wanted; StoreError for latents that are
-        missing or stale."""
+        used. `plans` False is a model without planned frames, for which n_plan_frames and max_goal_frames decide nothing;
+        without `low_dim` or `action` the model never sees them. Low_dim counts valid steps alone, actions those of episodes
+        that have them. Raises UsageError without training episodes, or without actions where they are wanted; StoreError for
+        latents that are missing or stale."""
         if not train:
             raise UsageError(
                 "there is no training episode", where=root, remedy="ingest more, or change the split's ratio"
@@ -103,12 +107,11 @@ class DataContract:
         if action:
             normaliser["action"] = moments(ChannelStats.over(_valid_steps(store, acting, "action")))
         return cls(
-            task=spec.name,
-            views=tuple(sorted(spec.views)),
-            geometry={name: (view.height, view.width, view.fit or "") for name, view in sorted(spec.views.items())},
+            **_of_views(spec),
             rate_hz=spec.rate_hz or train[0].rate_hz,
             frame_stride=window.frame_stride,
             n_plan_frames=window.n_plan_frames if plans else 0,
+            max_goal_frames=window.max_goal_frames if plans else None,
             latent_keys=dict(sorted((latent_keys or {}).items())),
             latent_shapes={
                 view: _latent_shape(root, view, key, train[0]) for view, key in sorted((latent_keys or {}).items())
@@ -118,6 +121,22 @@ class DataContract:
             action=tuple(fields["action"]) if action else (),
             action_size=len(normaliser["action"]["mean"]) if action else 0,
             normaliser=normaliser,
+        )
+
+    def as_said_by(self, spec: TaskSpec, *, latent_keys: Mapping[str, str] | None = None) -> DataContract:
+        """This contract, with what a task and the encoders' keys alone say in place of its own: what can be compared before
+        any file is read. A dataset that differs there may lack the files that the rest would be read from."""
+        fields = spec.ingest_fields()
+        return replace(
+            self,
+            **_of_views(spec),
+            rate_hz=spec.rate_hz or self.rate_hz,
+            frame_stride=spec.window.frame_stride,
+            n_plan_frames=spec.window.n_plan_frames if self.n_plan_frames else 0,
+            max_goal_frames=None if self.max_goal_frames is None else spec.window.max_goal_frames,
+            latent_keys=self.latent_keys if latent_keys is None else dict(sorted(latent_keys.items())),
+            low_dim=tuple(fields["low_dim"]) if self.low_dim else (),
+            action=tuple(fields["action"]) if self.action else (),
         )
 
     def now(
@@ -167,6 +186,8 @@ class DataContract:
         field that differs, both values, and what makes it right. `where` is the run; `model` its kind, for the command."""
         for name, (title, remedy) in _WORDS.items():
             there, here = getattr(self, name), getattr(now, name)
+            if name in _NOT_SAID and _NOT_SAID[name] in (there, here):
+                continue
             if name == "normaliser":
                 there, here = _other_moments(there, here)
             elif not isinstance(there, tuple | Mapping):
@@ -195,6 +216,10 @@ _WORDS: Mapping[str, tuple[str, str]] = {
         "another number of planned frames",
         "set n_plan_frames = {value} in the task's [window], or train again: {again}",
     ),
+    "max_goal_frames": (
+        "another number of repeated last frames",
+        "set max_goal_frames = {value} in the task's [window], or train again: {again}",
+    ),
     "latent_keys": (
         "latents of another VQGAN",
         "name the VQGAN run it was trained with (--vqgan RUN; `vilp-data latents --run RUN` encodes with it), "
@@ -214,6 +239,18 @@ _WORDS: Mapping[str, tuple[str, str]] = {
     ),
 }
 """Field -> (how it differs, what makes it right), in the order in which they are compared."""
+
+
+_NOT_SAID: Mapping[str, int | None] = {"n_plan_frames": 0, "max_goal_frames": None}
+"""Field -> the value with which one side says nothing of it, as an older checkpoint may; then there is nothing to compare."""
+
+
+def _of_views(spec: TaskSpec) -> dict[str, Any]:
+    return {
+        "task": spec.name,
+        "views": tuple(sorted(spec.views)),
+        "geometry": {name: (view.height, view.width, view.fit or "") for name, view in sorted(spec.views.items())},
+    }
 
 
 def moments(stats: ChannelStats) -> Moments:

@@ -65,10 +65,10 @@ def denoised(x_t: Tensor, predicted: Tensor, alpha_bar: float, prediction: Predi
 
 
 def ddim(
-    network: Network, noise: Tensor, alphas_bar: Tensor, levels: Sequence[int], prediction: Prediction = "v"
+    network: Network, noise: Tensor, alphas_bar: Sequence[float], levels: Sequence[int], prediction: Prediction = "v"
 ) -> Tensor:
     """x0 from `noise` by deterministic DDIM (Song et al. 2021, eq. 12 with η = 0) through `levels`, noisiest first."""
-    steps = [*alphas_bar[torch.tensor(levels)].tolist(), 1.0]
+    steps = [*(alphas_bar[level] for level in levels), 1.0]
     x = noise
     for i, level in enumerate(levels):
         t = torch.full(x.shape[:1], level, device=x.device)
@@ -78,13 +78,19 @@ def ddim(
 
 
 def dpm_solver(
-    network: Network, noise: Tensor, alphas_bar: Tensor, steps: int, *, spacing: Spacing, prediction: Prediction = "v"
+    network: Network,
+    noise: Tensor,
+    alphas_bar: Sequence[float],
+    steps: int,
+    *,
+    spacing: Spacing,
+    prediction: Prediction = "v",
 ) -> Tensor:
     """x0 from `noise` by DPM-Solver++ of second order (Lu et al. 2022), diffusers' multistep solver, in `steps` calls."""
-    before = torch.cat([alphas_bar.new_ones(1), alphas_bar[:-1]])
+    before = [1.0, *alphas_bar[:-1]]
     scheduler = DPMSolverMultistepScheduler(
         num_train_timesteps=len(alphas_bar),
-        trained_betas=(1 - alphas_bar / before).tolist(),
+        trained_betas=[1 - after / prior for after, prior in zip(alphas_bar, before, strict=True)],
         prediction_type="v_prediction" if prediction == "v" else "epsilon",
         timestep_spacing=spacing,
         rescale_betas_zero_snr=bool(

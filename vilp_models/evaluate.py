@@ -24,8 +24,7 @@ from vilp_models.imagined import Imagination
 from vilp_models.planner_page import write_planner_report
 from vilp_models.policy_page import write_policy_report
 from vilp_models.report_files import read_fresh_report, shown
-from vilp_models.trained import TrainedPlanners, default_device, load_low_level, load_planners
-from vilp_models.vqgan import load_frame_encoder
+from vilp_models.trained import TrainedPlanners, default_device, load_encoders, load_low_level, load_planners
 
 FOLDER = "evaluation"
 
@@ -103,12 +102,17 @@ def evaluate_planner(
 def evaluate_policy(
     root: Path, spec: TaskSpec, run_dir: Path, vqgan: Path, *, progress: Progress | None = None
 ) -> tuple[dict[str, Any], Path]:
-    """The report of the low-level policy in `run_dir` as plain data, and its folder. Raises what `load_low_level` and
-    `PairDataset` raise."""
+    """The report of the low-level policy in `run_dir` as plain data, and its folder. Raises what `load_encoders`, `load_low_level`
+    and `PairDataset` raise."""
     store, device = EpisodeStore(root), default_device()
-    encoders = {view: load_frame_encoder(vqgan, view) for view in sorted(spec.views)}
+    encoders = load_encoders(store, spec, vqgan, device=device)
     trained = load_low_level(store, spec, run_dir, encoders, device=device)
-    inputs = {"format": policy_report.REPORT_FORMAT, "policy": trained.digest, **_judged_on(store, vqgan)}
+    inputs = {
+        "format": policy_report.REPORT_FORMAT,
+        "policy": trained.digest,
+        "holds": {part: action.holds for part, action in spec.action.items()},
+        **_judged_on(store, vqgan),
+    }
     folder = run_dir / FOLDER
     table = read_fresh_report(folder, inputs)
     if table is None:
@@ -121,6 +125,7 @@ def evaluate_policy(
         )
         report = policy_report.policy_report(
             store,
+            spec,
             trained.policy,
             pairs,
             trained.contract.normaliser["action"]["mean"],

@@ -31,6 +31,11 @@ class Estimate:
         """Whether the whole interval lies above zero; False where there is none."""
         return self.low > 0
 
+    @property
+    def is_below_zero(self) -> bool:
+        """Whether the whole interval lies below zero; False where there is none."""
+        return self.high < 0
+
 
 def mean_estimate(values: Sequence[float] | F64, *, confidence: float = CONFIDENCE, draws: int = DRAWS) -> Estimate:
     """The mean of independent values [n], with the percentile interval of a bootstrap over them (Efron 1979).

@@ -77,8 +77,8 @@ class LowLevelPolicy(nn.Module):
     # --- training
 
     def losses(self, batch: PairTensors, generator: torch.Generator) -> dict[str, Tensor]:
-        """{"action": mean squared error in units of the actions' deviations}. In training mode `generator` draws which pairs
-        get a reconstructed second frame."""
+        """{"action": mean squared error in units of the actions' deviations}. In training mode the seed of `generator` decides which
+        pairs get a reconstructed second frame."""
         seen = batch.latents if self.recipe.sees == "latents" else batch.frames
         first = {view: seen[view][:, 0] for view in self.views}
         second: Images = {view: seen[view][:, 1] for view in self.views}
@@ -95,12 +95,13 @@ class LowLevelPolicy(nn.Module):
                 remedy="give `reconstruct` to the policy, or set the share to 0",
             )
         frames = next(iter(second.values()))
-        drawn = torch.rand(len(frames), generator=generator, device=generator.device) < self.recipe.reconstructed_share
-        chosen = drawn.nonzero().flatten().to(frames.device)
+        count = round(self.recipe.reconstructed_share * len(frames))
         mixed = {view: images.clone() for view, images in second.items()}
-        if len(chosen):
+        if count:
+            chosen = _drawn_rows(len(frames), count, generator.initial_seed(), frames.device)
             for view, images in mixed.items():
-                images[chosen] = self._reconstruct(view, latents[view][chosen, 1])
+                decoded = self._reconstruct(view, latents[view][:, 1].index_select(0, chosen))
+                images.index_copy_(0, chosen, decoded)
         return mixed
 
     # --- use
@@ -169,6 +170,13 @@ def mlp(in_features: int, hidden: Sequence[int], out_features: int) -> nn.Sequen
         layers += [nn.Linear(in_features, width), nn.ReLU()]
         in_features = width
     return nn.Sequential(*layers, nn.Linear(in_features, out_features))
+
+
+def _drawn_rows(size: int, count: int, seed: int, device: torch.device) -> Tensor:
+    """`count` of the numbers below `size`, int64 on `device`. Drawn in main memory, and so many whatever is drawn: nothing waits
+    for the device."""
+    rows = torch.randperm(size, generator=torch.Generator().manual_seed(seed))[:count]
+    return rows.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else rows.to(device)
 
 
 def _given(low_dim: Tensor | None) -> Tensor:

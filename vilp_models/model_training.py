@@ -29,12 +29,12 @@ class Batch(Protocol):
     def to(self, device: torch.device | str) -> Self: ...
 
 
-class LearningModule(nn.Module):
-    """What is trained here: a module with its own loss."""
+class LearningModule(Protocol):
+    """What is trained here: an `nn.Module` with its own loss."""
 
     def losses(self, batch: Any, generator: torch.Generator) -> dict[str, Tensor]:
         """Scalars by name, whose sum is minimised. All that is random comes from `generator`, on the batch's device."""
-        raise NotImplementedError
+        ...
 
 
 class ModelTraining:
@@ -47,7 +47,7 @@ class ModelTraining:
     def __init__(
         self,
         recipe: TrainingRecipe,
-        build: Callable[[], nn.Module],
+        build: Callable[[], LearningModule],
         dataset: BatchReader[Any],
         processes: Processes,
         *,
@@ -60,7 +60,10 @@ class ModelTraining:
         self.recipe, self.processes = recipe, processes
         with torch.random.fork_rng():
             torch.manual_seed(recipe.seed)
-            self.module = build().to(processes.device).train()
+            module = build()
+        assert isinstance(module, nn.Module)
+        self._losses = module.losses
+        self.module: nn.Module = module.to(processes.device).train()
         self._clips = clips
         self.optimizer = adamw(self.module, recipe)
         averages = recipe.ema_power > 0 and recipe.ema_max > 0
@@ -80,7 +83,7 @@ class ModelTraining:
         batch = self._batches.of_step(index).to(self.processes.device)
         self._generator.manual_seed(step_seed(self.recipe.seed, index, self.processes.rank))
         with self.processes.autocast():
-            losses: dict[str, Tensor] = self.module.losses(batch, self._generator)  # type: ignore[operator]
+            losses = self._losses(batch, self._generator)
         total = torch.stack([loss.float() for loss in losses.values()]).sum()
         norm = update(self.optimizer, total, clip_norm=self.recipe.clip_norm, processes=self.processes)
         if self.average is not None:

@@ -81,12 +81,24 @@ class Planner(nn.Module):
             one_token=recipe.condition.startswith("token+") or recipe.condition == "token",
         )
         alphas_bar = diffusion.cosine_alphas_bar(recipe.train_steps, zero_terminal_snr=recipe.prediction == "v")
-        self.register_buffer("alphas_bar", alphas_bar, persistent=False)
+        self._schedule: list[float] = alphas_bar.tolist()  # for samplers, which would wait for a device's numbers
+        self.register_buffer("alphas_bar", alphas_bar.float(), persistent=False)
 
     @property
     def sees_latents(self) -> bool:
         """Whether `condition` needs the present frames' latents."""
         return self.concatenates or self.recipe.clip == "present"
+
+    def denoising_steps(self, asked: int | None = None) -> int:
+        """As many as asked for, else the recipe's. Raises UsageError for more than there are noise levels to visit."""
+        steps, levels = asked or self.recipe.denoising_steps, self.recipe.train_steps
+        if steps > levels:
+            raise UsageError(
+                "more denoising steps than the planner knows noise levels",
+                found=f"{steps} denoising steps, models.planner.train_steps = {levels}",
+                remedy=f"ask for at most {levels}; few are enough, as the recipe's {self.recipe.denoising_steps}",
+            )
+        return steps
 
     # --- training
 
@@ -98,7 +110,7 @@ class Planner(nn.Module):
         condition = self.condition(batch.frames, batch.present_latents, batch.low_dim)
         level = torch.randint(len(self.alphas_bar), (len(x0),), generator=generator, device=x0.device)
         noise = torch.randn(x0.shape, generator=generator, device=x0.device)
-        alpha_bar = self.alphas_bar[level].float().view(-1, 1, 1, 1, 1)
+        alpha_bar = self.alphas_bar[level].view(-1, 1, 1, 1, 1)
         predicted = self.predict(diffusion.add_noise(x0, noise, alpha_bar), level, condition)
         wanted = diffusion.target(x0, noise, alpha_bar, self.recipe.prediction)
         return {"denoising": (predicted.float() - wanted).square().mean()}
@@ -135,8 +147,8 @@ class Planner(nn.Module):
     ) -> Tensor:
         """Imagined latents float32 [B,N,C,h,w] of frames t+Δt … t+NΔt, from unit `noise` of the same shape.
 
-        `steps` and `sampler` are the recipe's unless told otherwise."""
-        recipe, n_steps = self.recipe, steps or self.recipe.denoising_steps
+        `steps` and `sampler` are the recipe's unless told otherwise. Raises as `denoising_steps`."""
+        recipe, n_steps = self.recipe, self.denoising_steps(steps)
 
         def network(x: Tensor, t: Tensor) -> Tensor:
             return self.predict(x, t, condition)
@@ -144,10 +156,10 @@ class Planner(nn.Module):
         start, prediction = noise.float().transpose(1, 2), recipe.prediction
         if (sampler or recipe.sampler) == "ddim":
             levels = diffusion.sampling_levels(recipe.train_steps, n_steps, recipe.spacing)
-            x0 = diffusion.ddim(network, start, self.alphas_bar, levels, prediction)
+            x0 = diffusion.ddim(network, start, self._schedule, levels, prediction)
         else:
-            alphas = self.alphas_bar.cpu()
-            x0 = diffusion.dpm_solver(network, start, alphas, n_steps, spacing=recipe.spacing, prediction=prediction)
+            spacing = recipe.spacing
+            x0 = diffusion.dpm_solver(network, start, self._schedule, n_steps, spacing=spacing, prediction=prediction)
         return self._normaliser(self.view).restored(x0.transpose(1, 2).float())
 
     def _normaliser(self, view: str) -> Normaliser:

@@ -22,10 +22,11 @@ def planner_clips(
     """Draws clips uint8 [N,H,2W,3] of a planner of `view`: the recorded frames, as the encoder's VQGAN reconstructs them, beside
     the imagined ones. The same windows, spread over the dataset, and the same noise each time."""
     numbers = np.linspace(0, len(windows) - 1, WINDOWS).astype(np.int64)
+    stored = windows.read(numbers)  # now, since a stale file should not end a run that is half done
 
     def draw(planner: nn.Module) -> Clips:
         assert isinstance(planner, Planner)
-        batch = windows.read(numbers).to(device)
+        batch = stored.to(device)
         recorded = batch.latents[view].float()
         noise = torch.randn(recorded.shape, generator=torch.Generator().manual_seed(0)).to(device)
         condition = planner.condition(batch.frames, batch.present_latents, batch.low_dim)

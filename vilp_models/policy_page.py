@@ -40,7 +40,7 @@ def to_markdown(report: PolicyReport) -> str:
         [
             f"{report.n_pairs} pairs of {len(report.episodes)} validation episodes. Errors of a component, pooled over pairs; in "
             f"brackets 95 % intervals of a bootstrap over episodes ({RESAMPLES} draws), differences paired.",
-            "*Staying*: no motion for deltas; for absolute targets the present low_dim of the same columns, else the action before.",
+            "*Staying*: no motion for deltas; for absolute targets the present low_dim that the task names, else the action before.",
         ],
     ]
     for part in report.parts:

@@ -15,13 +15,13 @@ from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeStore
 from vilp_data.pairs import PairDataset, PairTensors
 from vilp_data.plots import vector_parts
-from vilp_data.spec import TaskSpec
+from vilp_data.spec import ActionSpec, TaskSpec
 from vilp_data.types import F32
 from vilp_models.imagined import Decoder, decode_frames
 from vilp_models.intervals import Estimate
 from vilp_models.plan_errors import Sums, score
 
-REPORT_FORMAT = 1
+REPORT_FORMAT = 2
 """Raised when the same inputs give other numbers."""
 
 POLICY = ("true", "reconstructed")
@@ -29,7 +29,8 @@ GUESSES = ("mean", "last", "hold")
 """true, reconstructed  the policy on true frames; on the VQGAN's reconstruction of the second one, as imagined frames will be
 mean                 the mean training action
 last                 the action before, repeated
-hold                 staying: no motion for deltas; for absolute targets the low_dim part with the same columns, else the action before"""
+hold                 staying: no motion for deltas; for absolute targets the low_dim part that `holds` or `from` names, or that reads the
+                     same fields of the same topic; else the action before"""
 
 GUESS_WORDS = {"mean": "the mean training action", "last": "the action before", "hold": "staying"}
 
@@ -101,6 +102,7 @@ class PolicyReport:
 
 def policy_report(
     store: EpisodeStore,
+    spec: TaskSpec,
     policy: PairPolicy,
     pairs: PairDataset,
     mean_action: Sequence[float],
@@ -110,9 +112,9 @@ def policy_report(
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> PolicyReport:
-    """Compare on every pair that has an action before it. `sees` is the recipe's: a policy that sees latents is judged on
-    those of both frames alone. With `decoders` also on reconstructed second frames, whose latents `pairs` must hold."""
-    spec = store.spec()
+    """Compare on every pair that has an action before it. `spec` says what staying is; `sees` is the recipe's: a policy that sees
+    latents is judged on those of both frames alone. With `decoders` also on reconstructed second frames, whose latents `pairs` must
+    hold."""
     candidates = [n for n in (*POLICY, *GUESSES) if n != "reconstructed" or (decoders and sees == "frames")]
     ids = pairs.episode_ids
     units = _units(spec, len(mean_action))
@@ -148,17 +150,24 @@ def hold_actions(spec: TaskSpec, low_dim: F32, last: F32) -> F32:
     before."""
     known = vector_parts(low_dim, spec.low_dim)
     out = []
-    for name, (labels, values) in vector_parts(last, spec.action).items():
+    for name, (_, values) in vector_parts(last, spec.action).items():
         action = spec.action.get(name)  # None where the spec does not tell the widths of the parts
         if action is not None and action.kind != "absolute":
             out.append(np.zeros_like(values))
             continue
-        named = action.from_ if action is not None else None
-        places = [
-            columns for part, (found, columns) in known.items() if part == named or (not named and found == labels)
-        ]
-        out.append(places[0] if len(places) == 1 and action is not None else values)
+        place = None if action is None else _place(spec, action)
+        held = known[place][1] if place in known else values
+        out.append(held if held.shape == values.shape else values)
     return np.concatenate(out, axis=1)
+
+
+def _place(spec: TaskSpec, action: ActionSpec) -> str | None:
+    """The low_dim part that an absolute command is a target for; None where the spec does not tell."""
+    if named := action.holds or action.from_:
+        return named
+    read = (action.topic, action.fields, action.names)
+    same = (name for name, part in spec.low_dim.items() if (part.topic, part.fields, part.names) == read)
+    return next(same, None)
 
 
 def _guesses(spec: TaskSpec, batch: PairTensors, last: F32, mean_action: Sequence[float]) -> dict[str, F32]:

@@ -22,7 +22,8 @@ class Processes:
     """
 
     def __init__(self, precision: Precision = "f32", *, device: str | torch.device | None = None) -> None:
-        """As the environment says (`accelerate launch`), or this process alone. `device` "cpu" leaves an accelerator out."""
+        """As the environment says (`accelerate launch`), or this process alone on `device`, such as "cuda:1". Of several processes
+        each has its own accelerator, unless `device` is "cpu", which leaves them out."""
         # accelerate keeps one precision a process, and a process may train models of several, one after the other
         AcceleratorState._reset_state()
         cpu = True if device is not None and torch.device(device).type == "cpu" else None
@@ -30,6 +31,8 @@ class Processes:
         self.rank: int = self._accelerator.process_index
         self.count: int = self._accelerator.num_processes
         self.device: torch.device = self._accelerator.device
+        if device is not None and self.count == 1:
+            self.device = torch.device(device)
 
     @property
     def is_main(self) -> bool:
@@ -51,6 +54,10 @@ class Processes:
     def total(self, tensor: Tensor) -> Tensor:
         """The sum over the processes."""
         return tensor if self.count == 1 else self._accelerator.reduce(tensor, "sum")
+
+    def any(self, here: bool) -> bool:
+        """Whether it is so in any process. All must ask, and wait for each other."""
+        return bool(self.total(torch.tensor(int(here), device=self.device)))
 
     def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
         """Overwrite each tensor with the main process's."""

@@ -14,7 +14,8 @@ Precision = Literal["f32", "bf16"]
 
 
 class VqganRecipe(Frozen):
-    """[models.vqgan]. The defaults are the paper's, for frames of any size that `downsampling` divides.
+    """[models.vqgan]. The defaults are the paper's, for frames of any size that `downsampling` divides. Its weights are not averaged
+    over time: those that others load are the last step's.
 
     Architecture
     width, multipliers  channels of level i are width * multipliers[i]; every level but the last halves the image, so
@@ -86,6 +87,7 @@ class VqganRecipe(Frozen):
             raise ValueError(f"crop = {self.crop} must be a multiple of the downsampling, {self.downsampling}")
         if self.codebook_start >= self.steps:
             raise ValueError(f"codebook_start = {self.codebook_start} must be less than steps = {self.steps}")
+        _require_warm(self.warmup_steps, self.steps)
         return self
 
     @property
@@ -169,6 +171,16 @@ class TrainingRecipe(Frozen):
     precision: Precision = "f32"
     seed: int = Field(default=0, ge=0)
 
+    @model_validator(mode="after")
+    def _warm_in_time(self) -> Self:
+        _require_warm(self.warmup_steps, self.steps)
+        return self
+
+
+def _require_warm(warmup_steps: int, steps: int) -> None:
+    if warmup_steps > steps:
+        raise ValueError(f"warmup_steps = {warmup_steps} must be at most steps = {steps}")
+
 
 Condition = Literal["token", "tokens", "concat", "token+concat", "tokens+concat"]
 
@@ -185,7 +197,8 @@ class PlannerRecipe(TrainingRecipe):
                         low_dim, "tokens" a grid of vectors a view, "concat" the present frames' latents beside the noisy ones
     vision_width        channels of the first level of the ResNet that sees the frames
     low_dim             whether low_dim is part of the condition; long videos need a planner without
-    clip                "future": frames t+Δt … t+NΔt (the paper's); "present": t … t+(N-1)Δt, the first one known (the release's)
+    clip                frames in the network: "future" has the N planned ones t+Δt … t+NΔt alone (the paper's), "present" N+1, of
+                        which the first is the frame at t, known (as the release's); planned are the same N
 
     Diffusion
     train_steps         levels of noise in training
@@ -324,7 +337,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "tiny": {**_ADAM_SMALL, "vision_width": 8, "pool": "keypoints", "hidden": (64,), "steps": 12, "batch_size": 8, "warmup_steps": 2},
         "cpu": {
             **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints",
-            "steps": 4000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
+            "steps": 3000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
         },
         "paper": {},
     },

@@ -60,6 +60,11 @@ def shown(value: float, digits: int = 2, *, sign: bool = False) -> str:
     return "–" if math.isnan(value) else f"{value:{'+' if sign else ''}.{digits}f}"
 
 
+def counted(count: int, noun: str) -> str:
+    """For people: `1 start`, `50 starts`."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
 def estimate_words(estimate: Estimate, digits: int = 2, *, sign: bool = False) -> str:
     """For people: `1.23 (1.10 to 1.35)`."""
     value, low, high = (shown(x, digits, sign=sign) for x in (estimate.value, estimate.low, estimate.high))

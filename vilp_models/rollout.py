@@ -34,10 +34,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What one start came to. `max_reward`: the highest reward of any step; `success`: at any step."""
+    """What one start came to. `policy_seed`: the start's; `max_reward`: the highest reward of any step; `success`: at any step."""
 
     name: str
-    seed: int
+    policy_seed: int
     max_reward: float
     success: bool
     n_steps: int
@@ -64,7 +64,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class LogPlan:
-    """Where logs go, one `<start's name>.mcap` each, and what their tags say beside task, seed, success and reward."""
+    """Where logs go, one `<start's name>.mcap` each, and what their tags say beside task, start, seeds, success and reward."""
 
     folder: Path
     tags: Mapping[str, str]
@@ -132,7 +132,7 @@ class _Batch:
             began = perf_counter()
             observation = self.world.reset(self.starts)
             self.timing.environments += perf_counter() - began
-            self.policy.reset([start.seed for start in self.starts])
+            self.policy.reset([start.policy_seed for start in self.starts])
             if self.logs is not None:
                 self.logs.open(files)
             step = 0
@@ -151,7 +151,7 @@ class _Batch:
 
     def results(self) -> list[EpisodeResult]:
         rows = zip(self.starts, self.max_reward, self.success, self.n_steps, strict=True)
-        return [EpisodeResult(s.name, s.seed, float(reward), bool(won), int(n)) for s, reward, won, n in rows]
+        return [EpisodeResult(s.name, s.policy_seed, float(reward), bool(won), int(n)) for s, reward, won, n in rows]
 
     def _plan(self, observation: Observation) -> F32:
         began = perf_counter()
@@ -203,8 +203,16 @@ class _Logs:
 
     def open(self, files: ExitStack) -> None:
         for start in self.starts:
-            tags = {"task": self.spec.name, **self.plan.tags, "seed": str(start.seed), "start": start.name}
-            recorder = EpisodeRecorder(self.plan.path(start), metadata={**tags, **dict([ROLLOUT_TAG])}, seed=start.seed)
+            tags = {
+                "task": self.spec.name,
+                **self.plan.tags,
+                "start": start.name,
+                "policy_seed": str(start.policy_seed),
+            }
+            if start.reset_seed is not None:
+                tags["seed"] = str(start.reset_seed)  # as in a demonstration: what the environment is reset with
+            metadata = {**tags, **dict([ROLLOUT_TAG])}
+            recorder = EpisodeRecorder(self.plan.path(start), metadata=metadata, seed=start.policy_seed)
             self.recorders.append(files.enter_context(recorder))
 
     def tick(self, actions: F32, active: np.typing.NDArray[np.bool_]) -> None:

@@ -1,12 +1,11 @@
 """What a rollout shows: mean of max reward and success rate, each with its interval, against another rollout pair by pair.
 
-A rollout's folder: report.json (written last: without it the rollout is not finished), report.md, logs/<start>.mcap, and
-videos/best, median and worst .mp4, drawn from the logs.
+A rollout's folder: report.json, report.md, logs/<start>.mcap, and videos/best, median and worst .mp4, drawn from the logs. It
+appears when all of it is there.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
@@ -24,8 +23,9 @@ from vilp_data.spec import TaskSpec
 from vilp_data.types import U8
 from vilp_models.intervals import Estimate, mean_estimate, paired_difference, rate_estimate
 from vilp_models.policies.base import Policy
-from vilp_models.report_files import estimate_table, estimate_words, markdown_table, page, write_report_files
+from vilp_models.report_files import counted, estimate_table, estimate_words, markdown_table, page, write_report_files
 from vilp_models.rollout import EpisodeResult, LogPlan, Progress, Timing, roll_out
+from vilp_models.rollout_folder import VIDEOS, find_rollout, new_rollout
 from vilp_models.starts import Start
 from vilp_models.video import write_mp4
 
@@ -45,7 +45,7 @@ class Against:
 
 @dataclass(frozen=True)
 class RolloutReport:
-    """A finished rollout. `tags` are the policy's own; `starts` says which, in a word."""
+    """A finished rollout. `tags` are the policy's own; `starts` says which, in a word ("100000:100050", "val")."""
 
     policy: str
     task: str
@@ -69,9 +69,11 @@ class RolloutReport:
         return rate_estimate(sum(episode.success for episode in self.episodes), len(self.episodes))
 
     def chosen(self) -> dict[str, EpisodeResult]:
-        """The best, median and worst episode by max reward; of equal ones the first."""
+        """The best, median and worst episode by max reward; of equal ones the first. No episode twice."""
         order = sorted(self.episodes, key=lambda episode: -episode.max_reward)
-        return {"best": order[0], "median": order[len(order) // 2], "worst": order[-1]}
+        if len(order) < len(VIDEOS):
+            return dict(zip(("best", "worst"), order, strict=False))
+        return dict(zip(VIDEOS, (order[0], order[len(order) // 2], order[-1]), strict=True))
 
     def to_json(self) -> dict[str, Any]:
         timing = self.timing
@@ -123,31 +125,24 @@ def roll_out_into(
     progress: Progress | None = None,
 ) -> RolloutReport:
     """Roll the policy called `name` out from `starts` (`what` they are, in a word), and leave the rollout in `folder`, in place of
-    whatever rollout was there; `against` are finished ones of the same starts.
+    the one that was there; `against` are finished ones of the same starts.
 
-    Nothing is left of one that is stopped but the folder. Raises as `rollout.roll_out` does, and UsageError where a rollout of
-    `against` cannot be compared: before anything is rolled out."""
+    One that is stopped leaves nothing, and what was there as it was. Raises as `rollout.roll_out` and `new_rollout` do, and
+    UsageError where a rollout of `against` cannot be compared: before anything is rolled out."""
     for other in against:
         require_comparable(other, task=spec.name, max_steps=max_steps, names=[start.name for start in starts])
-    _clear(folder)
-    tags = {"policy": name, **policy.tags}
-    logs = LogPlan(folder / "logs", tags) if with_logs else None
-    episodes, timing = roll_out(
-        spec, policy, starts, max_steps=max_steps, environments=environments, logs=logs, progress=progress
-    )
-    report = RolloutReport(
-        name, spec.name, what, max_steps, policy.n_action_steps, environments, policy.tags, episodes, timing
-    )
-    report = replace(report, against=tuple(compared(report, other) for other in against))
-    write_rollout(report, folder, spec, with_videos=with_logs)
+    with new_rollout(folder) as making:
+        tags = {"policy": name, **policy.tags}
+        logs = LogPlan(making / "logs", tags) if with_logs else None
+        episodes, timing = roll_out(
+            spec, policy, starts, max_steps=max_steps, environments=environments, logs=logs, progress=progress
+        )
+        report = RolloutReport(
+            name, spec.name, what, max_steps, policy.n_action_steps, environments, policy.tags, episodes, timing
+        )
+        report = replace(report, against=tuple(compared(report, other) for other in against))
+        write_rollout(report, making, spec, with_videos=with_logs)
     return report
-
-
-def _clear(folder: Path) -> None:
-    """Remove an earlier rollout, its report first: without it nothing counts."""
-    (folder / "report.json").unlink(missing_ok=True)
-    for path in (folder / "report.md", *folder.glob("logs/*.mcap"), *folder.glob("videos/*.mp4")):
-        path.unlink(missing_ok=True)
 
 
 def compared(report: RolloutReport, folder: Path) -> Against:
@@ -196,12 +191,10 @@ def finished_rollout(folder: Path, *, task: str, max_steps: int, names: Sequence
 
 def read_rollout(folder: Path) -> dict[str, Any]:
     """The report.json of a finished rollout. Raises UsageError where there is none."""
-    try:
-        table: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
-        raise UsageError(
-            "no finished rollout here", where=folder, remedy="make one with `vilp-models rollout --policy NAME`"
-        ) from error
+    table = find_rollout(folder)
+    if table is None:
+        remedy = "make one with `vilp-models rollout --policy NAME`"
+        raise UsageError("no finished rollout here", where=folder, remedy=remedy)
     return table
 
 
@@ -238,15 +231,21 @@ def format_rollout(table: Mapping[str, Any], folder: Path) -> list[str]:
     reward, success = _estimate(table["max_reward"]), _estimate(table["success"])
     won = sum(episode["success"] for episode in table["episodes"])
     lines = [
-        f"{table['policy']} on {len(table['episodes'])} starts ({table['starts']}), {table['max_steps']} steps each:",
+        f"{table['policy']} on {counted(len(table['episodes']), 'start')} ({table['starts']}), {table['max_steps']} steps each:",
         f"  mean of max reward {estimate_words(reward, 3)}",
-        f"  success            {estimate_words(success, 3)}, {won} episodes",
+        f"  success            {estimate_words(success, 3)}, {counted(won, 'episode')}",
     ]
     for other in table["against"]:
         difference = _estimate(other["max_reward"])
-        beyond = "beyond its interval" if difference.low > 0 or difference.high < 0 else "within its interval"
-        lines.append(f"  against {other['policy']:<11}{estimate_words(difference, 3, sign=True)}, {beyond}")
+        lines.append(f"  against {other['policy']:<11}{estimate_words(difference, 3, sign=True)}{_verdict(difference)}")
     return [*lines, f"  {_time_words(table['time'])}", f"{folder}/report.md shows it in full"]
+
+
+def _verdict(difference: Estimate) -> str:
+    """Where the interval of a difference lies; nothing where it spans zero, or there is none."""
+    if difference.is_above_zero:
+        return ": above"
+    return ": below" if difference.is_below_zero else ""
 
 
 def to_markdown(report: RolloutReport) -> str:
@@ -268,8 +267,8 @@ def to_markdown(report: RolloutReport) -> str:
         for e in report.episodes
     ]
     what = (
-        f"{len(report.episodes)} starts ({report.starts}), at most {report.max_steps} steps each, {report.n_action_steps} actions a "
-        f"plan, {report.environments} environments together."
+        f"{counted(len(report.episodes), 'start')} ({report.starts}), at most {report.max_steps} steps each, {report.n_action_steps} "
+        f"actions a plan, {report.environments} environments together."
     )
     return page(
         [],

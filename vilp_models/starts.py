@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,14 +20,15 @@ SIDES = ("val", "train", "all")
 
 @dataclass(frozen=True)
 class Start:
-    """Where an episode begins. `name` tells it from others and names its files; `seed` is the policy's.
+    """Where an episode begins. `name` tells it from others and names its files.
 
-    reset_seed  the environment's, where it draws its own start
-    state       float64 [S]: the recorded state to begin at instead
+    policy_seed  what the policy draws from, and by which it finds the start's recording
+    reset_seed   what the environment is reset with, if anything: it draws its own start from that
+    state        float64 [S]: the recorded state to begin at instead
     """
 
     name: str
-    seed: int
+    policy_seed: int
     reset_seed: int | None
     state: F64 | None = None
 
@@ -75,15 +77,13 @@ def episode_starts(
     store: EpisodeStore, side: str, *, limit: int | None = None
 ) -> tuple[list[Start], dict[int, Recording]]:
     """The first recorded state of each stored episode on a side of the split ("val", "train", or "all" there are), the first
-    `limit` of them by id; and the recordings, by the start's seed: the episode's number in the dataset.
+    `limit` of them by id; and the recordings, by the start's policy seed: `episode_seed` of their id.
 
     Raises UsageError for an unknown side, where no such episode has actions and simulator states, or where one begins with a step
     that cannot be used; SplitError where the dataset has no split."""
     if side not in SIDES:
         raise UsageError(f"no such side of the split: {side!r}", remedy=nearest(side, SIDES))
-    index = store.index()
-    numbers = {entry.id: number for number, entry in enumerate(index)}
-    entries = index if side == "all" else side_episodes(store, "val" if side == "val" else "train")
+    entries = store.index() if side == "all" else side_episodes(store, "val" if side == "val" else "train")
     played = [entry for entry in entries if entry.has_action and entry.has_state and not is_rollout(entry.tags)][:limit]
     if not played:
         raise UsageError(
@@ -91,17 +91,19 @@ def episode_starts(
             where=store.root,
             remedy="roll out from --seeds instead",
         )
-    recordings = {numbers[entry.id]: open_recording(store, entry) for entry in played}
-    starts = [
-        Start(
-            entry.id,
-            numbers[entry.id],
-            int(entry.tags["seed"]) if "seed" in entry.tags else None,
-            np.array(recordings[numbers[entry.id]].state[0], np.float64),
-        )
-        for entry in played
-    ]
+    recordings, starts = {}, []
+    for entry in played:
+        seed, recording = episode_seed(entry.id), open_recording(store, entry)
+        recordings[seed] = recording
+        reset_seed = int(entry.tags["seed"]) if "seed" in entry.tags else None
+        starts.append(Start(entry.id, seed, reset_seed, np.array(recording.state[0], np.float64)))
     return starts, recordings
+
+
+def episode_seed(episode: str) -> int:
+    """A seed from the id of an episode alone, so that it stays when episodes are added: 48 bits, which no two ids of a dataset share
+    but by an odd chance, and JSON numbers hold."""
+    return int.from_bytes(hashlib.sha256(episode.encode()).digest()[:6])
 
 
 def open_recording(store: EpisodeStore, entry: EpisodeEntry) -> Recording:

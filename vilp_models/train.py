@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ValidationError
 
 from vilp_data.dataset import WindowDataset
 from vilp_data.dataset_split import read_split, side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import BusyError, StoreError, UsageError, nearest
+from vilp_data.errors import BusyError, NoWindowError, UsageError, VilpDataError, nearest
 from vilp_data.pairs import PairDataset
 from vilp_data.shards import writer_lock
-from vilp_data.spec import TaskSpec
-from vilp_models.checkpoint import FILE, RunState, read_recipe, read_state, run_folder
+from vilp_data.spec import TaskSpec, WindowSpec
+from vilp_models.checkpoint import RunState, read_recipe, read_state, run_folder
 from vilp_models.contract import ContractOf, DataContract
-from vilp_models.curves import FOLDER as CURVES
 from vilp_models.frames import TrainingFrames, open_clips
-from vilp_models.model_training import ModelTraining
+from vilp_models.model_training import Clips, ModelTraining
 from vilp_models.processes import Processes
 from vilp_models.recipe import BcRecipe, PlannerRecipe, PolicyRecipe, TrainingRecipe, VqganRecipe
 from vilp_models.training_loop import Trainee, fit
-from vilp_models.vqgan import VqganEncoder, load_frame_encoder, to_frames
+from vilp_models.vqgan import VqganEncoder
 from vilp_models.vqgan_training import VqganTraining
 
 
@@ -94,7 +93,8 @@ def train_vqgan(
 
     groups = [tuple(sorted(spec.views))] if recipe.share_views else [(view,) for view in sorted(spec.views)]
     runs = [run_of(views) for views in groups]
-    return _bring_all_to_end(runs, episodes, split_hash, restart=restart, device=device, show=show)
+    processes = Processes(recipe.precision, device=device)
+    return _bring_all_to_end(runs, episodes, split_hash, processes, restart=restart, show=show)
 
 
 def train_planner(
@@ -110,12 +110,14 @@ def train_planner(
 ) -> list[RunState]:
     """Train one planner a view on latents that the VQGAN run `vqgan` made, over windows of `spec.window`.
 
-    Returns and raises as `train_vqgan`; StoreError where latents are missing."""
+    Returns and raises as `train_vqgan`; StoreError where latents are missing, SplitError where the VQGAN knows today's
+    validation episodes."""
     from vilp_models.planner import Planner
     from vilp_models.planner_clips import planner_clips
 
     episodes, split_hash = _training_side(dataset_dir)
-    encoders = _encoders(spec, vqgan)
+    processes = Processes(recipe.precision, device=device)
+    encoders = _encoders(dataset_dir, spec, vqgan, processes)
     keys = {view: encoder.key for view, encoder in encoders.items()}
 
     def contract(train: Sequence[EpisodeEntry]) -> DataContract:
@@ -127,10 +129,12 @@ def train_planner(
     def run_of(view: str) -> Run:
         def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
             assert agreed is not None
+            clips: Callable[[torch.nn.Module], Clips] | None = None
             try:
                 clips = planner_clips(windows("val"), view, encoders[view], device=processes.device)
-            except StoreError:  # validation may be too little for a window; training can do without pictures
-                clips = None
+            except NoWindowError:  # training can do without pictures
+                if show and processes.is_main:
+                    print(f"planner {view}: no window fits the validation episodes, so no clips are drawn of them")
             return ModelTraining(
                 recipe, lambda: Planner(recipe, agreed, view), windows("train"), processes, clips=clips
             )
@@ -138,7 +142,7 @@ def train_planner(
         return Run("planner", (view,), run_folder(run_dir, (view,)), recipe, trainee, contract, unit="clips")
 
     runs = [run_of(view) for view in sorted(spec.views)]
-    return _bring_all_to_end(runs, episodes, split_hash, restart=restart, device=device, show=show)
+    return _bring_all_to_end(runs, episodes, split_hash, processes, restart=restart, show=show)
 
 
 def train_policy(
@@ -159,11 +163,12 @@ def train_policy(
     from vilp_models.low_level import LowLevelPolicy
 
     episodes, split_hash = _training_side(dataset_dir, acting=True)
+    processes = Processes(recipe.precision, device=device)
     encoders = {}
     if recipe.sees == "latents" or recipe.reconstructed_share:
         if vqgan is None:
             raise UsageError("this policy's recipe needs a VQGAN", where=run_dir, remedy="name its run with --vqgan")
-        encoders = _encoders(spec, vqgan)
+        encoders = _encoders(dataset_dir, spec, vqgan, processes)
     keys = {view: encoder.key for view, encoder in encoders.items()}
     views = tuple(sorted(spec.views))
 
@@ -182,8 +187,9 @@ def train_policy(
         codebooks = {view: encoder.model.quantize.embedding.weight.detach() for view, encoder in encoders.items()}
 
         def reconstruct(view: str, latents: torch.Tensor) -> torch.Tensor:
-            decoded = encoders[view].model.decode(latents.to(encoders[view].device).float()).sample
-            return to_frames(decoded).to(latents.device)
+            encoder = encoders[view]
+            with torch.autocast(encoder.device.type, enabled=False):  # as imagined frames are decoded in use
+                return encoder.decode_tensor(latents.to(encoder.device)).to(latents.device)
 
         def build() -> LowLevelPolicy:
             return LowLevelPolicy(recipe, agreed, codebooks=codebooks, reconstruct=reconstruct)
@@ -191,7 +197,7 @@ def train_policy(
         return ModelTraining(recipe, build, pairs, processes)
 
     run = Run("policy", views, run_folder(run_dir, views), recipe, trainee, contract, unit="pairs")
-    return _bring_all_to_end([run], episodes, split_hash, restart=restart, device=device, show=show)
+    return _bring_all_to_end([run], episodes, split_hash, processes, restart=restart, show=show)
 
 
 def train_bc(
@@ -207,30 +213,27 @@ def train_bc(
 ) -> list[RunState]:
     """Train behaviour cloning of all views together: one observation to the next `n_action_steps` actions.
 
-    Returns and raises as `train_vqgan`; UsageError too where a window holds fewer actions than that."""
+    Only episodes with actions are read, from every step that has one: windows are as long as a chunk, whatever the planner's
+    are, and a chunk that reaches past the end is learnt as far as it was recorded. Returns and raises as `train_vqgan`."""
     from vilp_models.policies.bc import BcNetwork
 
     episodes, split_hash = _training_side(dataset_dir, acting=True)
-    views, window = tuple(sorted(spec.views)), spec.window
-    if n_action_steps > window.n_plan_frames * window.frame_stride:
-        raise UsageError(
-            f"n_action_steps = {n_action_steps} is more than a window's actions",
-            where=spec.name,
-            found=f"n_plan_frames = {window.n_plan_frames}, frame_stride = {window.frame_stride}",
-            remedy="lower n_action_steps in [models.vilp], or raise n_plan_frames in [window]",
-        )
+    views, stride = tuple(sorted(spec.views)), spec.window.frame_stride
+    n_frames = -(-n_action_steps // stride)
+    chunk = WindowSpec(n_plan_frames=n_frames, frame_stride=stride, max_goal_frames=n_frames)
 
     def contract(train: Sequence[EpisodeEntry]) -> DataContract:
-        return DataContract.of(dataset_dir, spec, train=train, low_dim=recipe.low_dim)
+        return DataContract.of(dataset_dir, spec, train=train, plans=False, low_dim=recipe.low_dim)
 
     def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
         assert agreed is not None
-        windows = WindowDataset(dataset_dir, split="train", latent_keys={}, views=views, window=window)
+        windows = WindowDataset(dataset_dir, split="train", latent_keys={}, views=views, window=chunk, acting=True)
         return ModelTraining(recipe, lambda: BcNetwork(recipe, agreed, n_action_steps), windows, processes)
 
     built_by = {"n_action_steps": n_action_steps}
     run = Run("bc", views, run_folder(run_dir, views), recipe, trainee, contract, built_by, unit="windows")
-    return _bring_all_to_end([run], episodes, split_hash, restart=restart, device=device, show=show)
+    processes = Processes(recipe.precision, device=device)
+    return _bring_all_to_end([run], episodes, split_hash, processes, restart=restart, show=show)
 
 
 def _training_side(dataset_dir: Path, *, acting: bool = False) -> tuple[list[EpisodeEntry], str]:
@@ -240,8 +243,12 @@ def _training_side(dataset_dir: Path, *, acting: bool = False) -> tuple[list[Epi
     return episodes, read_split(dataset_dir).hash
 
 
-def _encoders(spec: TaskSpec, vqgan: Path) -> dict[str, VqganEncoder]:
-    return {view: load_frame_encoder(vqgan, view) for view in sorted(spec.views)}
+def _encoders(dataset_dir: Path, spec: TaskSpec, vqgan: Path, processes: Processes) -> dict[str, VqganEncoder]:
+    """Each view's VQGAN where this process computes; on its own kind of device otherwise, which the latents' key names."""
+    from vilp_models.trained import default_device, load_encoders
+
+    here = str(processes.device) if processes.device.type == default_device() else None
+    return load_encoders(EpisodeStore(dataset_dir), spec, vqgan, device=here)
 
 
 # --- runs ------------------------------------------------------------------------------------------------------------
@@ -251,15 +258,12 @@ def _bring_all_to_end(
     runs: Sequence[Run],
     episodes: Sequence[EpisodeEntry],
     split_hash: str,
+    processes: Processes,
     *,
     restart: bool,
-    device: str | None,
     show: bool,
 ) -> list[RunState]:
-    states = []
-    for run in runs:
-        processes = Processes(run.recipe.precision, device=device)
-        states.append(_bring_to_end(run, episodes, split_hash, processes, restart=restart, show=show))
+    states = [_bring_to_end(run, episodes, split_hash, processes, restart=restart, show=show) for run in runs]
     processes.end()
     return states
 
@@ -277,14 +281,10 @@ def _bring_to_end(
 
     A finished run with this recipe and contract is left alone; an unfinished one goes on exactly where it stopped. Raises
     UsageError where the run there has another recipe or contract, or is unfinished and has other episodes (`restart`
-    begins those anew), BusyError where another process trains into it, DivergedError where a loss stops being finite,
-    KeyboardInterrupt on Ctrl-C, saved.
+    begins those anew, and leaves what is there until its own first checkpoint replaces it), BusyError where another process
+    trains into it, DivergedError where a loss stops being finite, KeyboardInterrupt on Ctrl-C, saved.
     """
-    with _only_trainer(run.folder) if processes.is_main else contextlib.nullcontext():
-        if restart and processes.is_main:
-            (run.folder / FILE).unlink(missing_ok=True)
-            shutil.rmtree(run.folder / CURVES, ignore_errors=True)
-        processes.wait()
+    with _only_trainer(run.folder, processes):
         table = run.recipe.model_dump(mode="json")
         wanted = RunState(
             step=0,
@@ -295,7 +295,7 @@ def _bring_to_end(
             model=run.model,
             built_by=run.built_by,
         )
-        earlier = read_state(run.folder)
+        earlier = None if restart else read_state(run.folder)
         if earlier is not None and not _must_train(run, table, wanted, earlier, episodes):
             if show and processes.is_main:
                 print(f"{run.label}: trained already, {earlier.steps} steps{_unseen(earlier, wanted)}")
@@ -305,20 +305,28 @@ def _bring_to_end(
             wanted = replace(wanted, contract=contract.to_json())
         trainee = run.trainee(processes, contract)
         return fit(
-            trainee, run.folder, wanted, table, processes, unit=run.unit, per_step=run.recipe.batch_size, show=show
-        )
+            trainee, run.folder, wanted, table, processes,
+            unit=run.unit, per_step=run.recipe.batch_size, resume=not restart, show=show,
+        )  # fmt: skip
 
 
 @contextlib.contextmanager
-def _only_trainer(run: Path) -> Iterator[None]:
-    """Be the only process that trains into this run. Raises BusyError at once where another does."""
+def _only_trainer(run: Path, processes: Processes) -> Iterator[None]:
+    """Be the only ones who train into this run; the main process holds the lock. Raises BusyError at once where another does, in
+    every process: one that went on would wait for the main one for ever."""
     with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(writer_lock(run))
-        except BusyError as error:
+        refused: VilpDataError | None = None
+        if processes.is_main:
+            try:
+                stack.enter_context(writer_lock(run))
+            except VilpDataError as error:
+                refused = error
+        if processes.any(refused is not None):
+            if refused is not None and not isinstance(refused, BusyError):
+                raise refused
             raise BusyError(
                 "another process is training this run", where=run, remedy="wait until it is done, or stop it"
-            ) from error
+            ) from refused
         yield
 
 
@@ -326,7 +334,7 @@ def _must_train(
     run: Run, recipe: Mapping[str, Any], wanted: RunState, earlier: RunState, episodes: Sequence[EpisodeEntry]
 ) -> bool:
     """Whether the run in this folder is to go on (True) or is there (False); UsageError where it is another run."""
-    old, recipe = {**read_recipe(run.folder), **earlier.built_by}, {**recipe, **wanted.built_by}
+    old, recipe = {**_as_of_today(run), **earlier.built_by}, {**recipe, **wanted.built_by}
     changed = sorted(key for key in {*recipe, *old} if recipe.get(key) != old.get(key))
     remedy = "train again with --restart, or into another folder"
     if earlier.model != wanted.model:
@@ -353,6 +361,15 @@ def _must_train(
         now = run.contract([entry for entry in episodes if entry.id in earlier.train_episodes])
         DataContract.from_json(earlier.contract).require_same(now, where=run.folder, model=run.model)
     return not earlier.finished
+
+
+def _as_of_today(run: Run) -> dict[str, Any]:
+    """The recipe that the run in this folder was trained with; a key that came later has its default, which is how it was."""
+    stored = read_recipe(run.folder)
+    try:
+        return type(run.recipe).model_validate(stored).model_dump(mode="json")
+    except ValidationError:  # keys or values of then that are none today
+        return stored
 
 
 def _unseen(earlier: RunState, wanted: RunState) -> str:

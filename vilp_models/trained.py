@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,16 @@ from vilp_data.dataset_split import side_episodes
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.spec import TaskSpec, WindowSpec
-from vilp_models.checkpoint import TrainedRun, checkpoint_digest, load_run, refuse_trained_on_validation, run_folder
+from vilp_models.checkpoint import (
+    FILE,
+    TrainedRun,
+    checkpoint_digest,
+    load_run,
+    read_state,
+    refuse_trained_on_validation,
+    run_folder,
+    run_for_view,
+)
 from vilp_models.contract import DataContract
 from vilp_models.low_level import LowLevelPolicy
 from vilp_models.planner import Planner
@@ -62,6 +71,16 @@ class TrainedBc:
     digest: str
 
 
+def load_encoders(
+    store: EpisodeStore, spec: TaskSpec, vqgan: Path, *, device: str | None = None
+) -> dict[str, VqganEncoder]:
+    """The VQGAN in `vqgan` of each view of `spec`, on `device` or as `load_frame_encoder` chooses. Raises as that does, and
+    SplitError where one knows today's validation episodes."""
+    encoders = {view: load_frame_encoder(vqgan, view, device=device) for view in sorted(spec.views)}
+    _refuse_seen(store, vqgan, encoders)
+    return encoders
+
+
 def load_planners(
     store: EpisodeStore, spec: TaskSpec, run_dir: Path, vqgan: Path, *, device: str = "cpu"
 ) -> TrainedPlanners:
@@ -69,17 +88,18 @@ def load_planners(
 
     Raises UsageError where one is missing, unfinished, made of another dataset or another VQGAN; SplitError where one knows today's
     validation episodes, StoreError for damage."""
-    encoders = {view: load_frame_encoder(vqgan, view) for view in sorted(spec.views)}
-    keys = {view: encoder.key for view, encoder in encoders.items()}
+    _refuse_other_task(spec, run_dir, [run_folder(run_dir, (view,)) for view in sorted(spec.views)], "planner")
+    encoders = {view: load_frame_encoder(vqgan, view, device=device) for view in sorted(spec.views)}
     planners, digests = {}, {}
     for view in encoders:
         run = run_folder(run_dir, (view,))
-        trained = _checked(store, spec, run, "planner", keys)
+        trained = _checked(store, spec, run, "planner", encoders)
         recipe = PlannerRecipe.model_validate(trained.recipe)
         planners[view] = Planner(recipe, trained.contract, view)
         load_arrays(planners[view], trained.arrays)
         planners[view].eval().requires_grad_(False).to(device)
         digests[view] = checkpoint_digest(run)
+    _refuse_seen(store, vqgan, encoders)
     return TrainedPlanners(planners, encoders, trained.contract, recipe, digests)
 
 
@@ -88,7 +108,8 @@ def load_low_level(
 ) -> TrainedPolicy:
     """The low-level policy in `run_dir`. Raises as `load_planners`."""
     run = run_folder(run_dir, tuple(spec.views))
-    trained = _checked(store, spec, run, "policy", {view: encoder.key for view, encoder in encoders.items()})
+    _refuse_other_task(spec, run_dir, [run], "policy")
+    trained = _checked(store, spec, run, "policy", encoders)
     recipe = PolicyRecipe.model_validate(trained.recipe)
     policy = LowLevelPolicy(recipe, trained.contract)
     load_arrays(policy, trained.arrays)
@@ -102,17 +123,17 @@ def load_bc(
     """The behaviour cloning network in `run_dir`, which gives chunks of `n_action_steps`. Raises as `load_planners`, and UsageError
     where it was trained on chunks of another length."""
     run = run_folder(run_dir, tuple(spec.views))
+    _refuse_other_task(spec, run_dir, [run], "bc")
     trained = _checked(store, spec, run, "bc", {})
-    recipe = BcRecipe.model_validate(trained.recipe)
-    n_outputs = len(trained.arrays[f"head.{2 * len(recipe.hidden)}.bias"])
-    if n_outputs != n_action_steps * trained.contract.action_size:
+    recipe, learnt = BcRecipe.model_validate(trained.recipe), trained.state.built_by["n_action_steps"]
+    if learnt != n_action_steps:
         raise UsageError(
-            "trained on chunks of another length than are executed",
+            "this model was trained on chunks of another length than are executed",
             where=run,
-            found=f"{n_outputs // trained.contract.action_size} actions, models.vilp.n_action_steps = {n_action_steps}",
-            remedy="set n_action_steps to that in the task TOML, or train again: `vilp-models train bc --restart`",
+            found=f"n_action_steps {learnt} in the model, {n_action_steps} in [models.vilp]",
+            remedy=f"set n_action_steps = {learnt} in the task's [models.vilp], or train again: `vilp-models train bc --restart`",
         )
-    network = BcNetwork(recipe, trained.contract, n_action_steps)
+    network = BcNetwork(recipe, trained.contract, learnt)
     load_arrays(network, trained.arrays)
     network.eval().requires_grad_(False).to(device)
     return TrainedBc(network, checkpoint_digest(run))
@@ -123,20 +144,44 @@ def default_device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _checked(store: EpisodeStore, spec: TaskSpec, run: Path, kind: str, latent_keys: Mapping[str, str]) -> TrainedRun:
-    """The run, once its contract was compared with the dataset's under `latent_keys`, and its episodes with validation."""
+def _key(encoder: VqganEncoder, known: str) -> str:
+    """`known`, where this network makes such latents on some kind of device: a policy may act on another than its latents were
+    made on, which differ in rounding alone. Else the encoder's own key."""
+    return known if known in (encoder.key_on("cpu"), encoder.key_on("cuda")) else encoder.key
+
+
+def _refuse_seen(store: EpisodeStore, vqgan: Path, views: Iterable[str]) -> None:
+    """Raise SplitError where the VQGAN of one of these views was trained on today's validation episodes."""
+    val = side_episodes(store, "val")
+    for view in views:
+        run = run_for_view(vqgan, view)
+        state = read_state(run)
+        if state is not None:
+            refuse_trained_on_validation(state, val, where=run)
+
+
+def _refuse_other_task(spec: TaskSpec, run_dir: Path, wanted: Sequence[Path], kind: str) -> None:
+    """Compare what `spec` alone says with the runs that are wanted, before anything of today's views is read.
+
+    Runs are named after their views: where one is missing, those there are say which views they know. Raises UsageError."""
+    all_there = all((run / FILE).is_file() for run in wanted)
+    for run in wanted if all_there else sorted(path.parent for path in run_dir.glob(f"*/{FILE}")):
+        state = read_state(run)
+        if state is not None and state.model == kind and state.contract is not None:
+            there = DataContract.from_json(state.contract)
+            there.require_same(there.as_said_by(spec), where=run, model=kind)
+
+
+def _checked(
+    store: EpisodeStore, spec: TaskSpec, run: Path, kind: str, encoders: Mapping[str, VqganEncoder]
+) -> TrainedRun:
+    """The run, once its contract was compared with the dataset's under the encoders' latents, and its episodes with validation."""
     trained = load_run(run, kind)
     refuse_trained_on_validation(trained.state, side_episodes(store, "val"), where=run)
     there = trained.contract
+    keys = {view: _key(encoders[view], known) for view, known in there.latent_keys.items() if view in encoders}
+    # Another VQGAN may not have encoded these episodes, and then there are no latents to take statistics of.
+    there.require_same(there.as_said_by(spec, latent_keys=keys), where=run, model=kind)
     known = [entry for entry in store.index() if entry.id in trained.state.train_episodes]
-    now = DataContract.of(
-        store.root,
-        spec,
-        train=known,
-        latent_keys={view: key for view, key in latent_keys.items() if view in there.latent_keys},
-        plans=bool(there.n_plan_frames),
-        low_dim=bool(there.low_dim),
-        action=bool(there.action),
-    )
-    there.require_same(now, where=run, model=kind)
+    there.require_same(there.now(store.root, spec, known, latent_keys=keys), where=run, model=kind)
     return trained

@@ -68,17 +68,20 @@ def fit(
     *,
     unit: str = "samples",
     per_step: int = 1,
+    resume: bool = True,
     show: bool = True,
     checkpoint_every_s: float = CHECKPOINT_EVERY_S,
 ) -> RunState:
     """Train to `state.steps`, from the checkpoint in `run` where there is one; save on the way, at the end, on Ctrl-C.
+
+    Without `resume` training begins at the first step, and the first checkpoint replaces the one that is there.
 
     `per_step` of `unit` is what the bar counts besides steps. An error leaves the last checkpoint as it is, and
     DivergedError comes before one that would hold what is not finite. Of several processes the main one writes and
     prints; all stop together, Ctrl-C within READ_EVERY steps.
     """
     first = 0
-    if read_state(run) is not None:
+    if resume and read_state(run) is not None:
         checkpoint = load_checkpoint(run)
         trainee.restore(checkpoint.model, checkpoint.trainer)
         first = checkpoint.state.step

@@ -51,4 +51,4 @@ def load_optimizer(optimizer: Optimizer, arrays: Arrays, *, prefix: str) -> None
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().contiguous().numpy()
+    return tensor.detach().to("cpu", copy=True).contiguous().numpy()

@@ -100,6 +100,10 @@ class VqganEncoder:
         """16 hex digits: the digest of `key_fields`."""
         return digest(self.key_fields)[:16]
 
+    def key_on(self, device: str) -> str:
+        """The key of latents that the same network makes on another kind of device ("cpu", "cuda"): these differ in rounding."""
+        return digest({**self.key_fields, "device": device})[:16]
+
     @property
     def key_fields(self) -> dict[str, str]:
         """All that decides the bytes of stored latents, and nothing else: decoder and codebook have no part in it.
@@ -158,8 +162,11 @@ class VqganEncoder:
 
     @torch.inference_mode()
     def decode_tensor(self, z_BCHW: Tensor) -> Tensor:
-        """`decode` on the encoder's device: latents of any float type to uint8 [B,H,W,3]."""
-        return to_frames(self.model.decode(z_BCHW.float()).sample)
+        """`decode` on the encoder's device: latents of any float type to uint8 [B,H,W,3]. Under autocast codes are still chosen in
+        float32, whose digits the distances need."""
+        with torch.autocast(self.device.type, enabled=False):
+            z_q = self.model.quantize(z_BCHW.float())[0]
+        return to_frames(self.model.decode(z_q, force_not_quantize=True).sample)
 
 
 def encoder_digest(model: VQModel) -> str:
@@ -181,11 +188,11 @@ def load_vqgan(run: Path) -> tuple[VQModel, VqganRecipe]:
     return model, recipe
 
 
-def load_frame_encoder(run_dir: Path, view: str) -> VqganEncoder:
+def load_frame_encoder(run_dir: Path, view: str, *, device: str | torch.device | None = None) -> VqganEncoder:
     """The frame encoder of one view: what the entry-point group `vilp.frame_encoders` names.
 
-    `run_dir` is what `train_vqgan` wrote. Raises UsageError where no VQGAN there was trained on this view to its end,
-    StoreError where the checkpoint is damaged.
+    `run_dir` is what `train_vqgan` wrote; without a `device` it is an accelerator if there is one. Raises UsageError where no VQGAN
+    there was trained on this view to its end, StoreError where the checkpoint is damaged.
     """
     run = run_for_view(run_dir, view)
     state = read_state(run)
@@ -197,5 +204,5 @@ def load_frame_encoder(run_dir: Path, view: str) -> VqganEncoder:
         model,
         precision=recipe.encode_precision,
         trained_on=state.train_episodes.values() if state is not None else (),
-        device="cuda" if torch.cuda.is_available() else "cpu",
+        device=device or ("cuda" if torch.cuda.is_available() else "cpu"),
     )

@@ -157,7 +157,9 @@ class VqganTraining:
 
     @torch.no_grad()
     def _count_codes(self, index: int, codes: Tensor, latents: Tensor) -> None:
-        self.uses += self.processes.total(torch.bincount(codes.flatten(), minlength=self.recipe.codes))
+        chosen = codes.flatten()  # not by bincount, which waits for the device to see how many there are
+        here = torch.zeros_like(self.uses).scatter_add_(0, chosen, torch.ones_like(chosen))
+        self.uses += self.processes.total(here)
         if not self.recipe.restart_every or (index + 1) % self.recipe.restart_every:
             return
         dead = self.uses == 0

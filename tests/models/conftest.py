@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -16,6 +16,9 @@ from vilp_data.spec import TaskSpec, parse_task
 from vilp_data.types import Episode
 from vilp_models.frames import Clip, TrainingFrames
 from vilp_models.recipe import VqganRecipe
+
+if TYPE_CHECKING:
+    from tests.models.trained_cards import TrainedCards
 
 HEIGHT, WIDTH, STEPS = 32, 48, 12
 VIEWS = ("front", "side")
@@ -74,6 +77,15 @@ def _episode(episode_id: str, number: int) -> Episode:
         tags={},
         outcome="success",
     )
+
+
+@pytest.fixture(scope="session")
+def trained_cards(tmp_path_factory: pytest.TempPathFactory) -> TrainedCards:
+    """Trained once for all tests: leave dataset and checkpoints as they are, or work on a copy of the folder."""
+    from tests.models.trained_cards import train_cards
+
+    torch.set_num_threads(1)
+    return train_cards(tmp_path_factory.mktemp("cards"))
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ N_ACTION_STEPS = 4
 
 def network(n_action_steps: int = N_ACTION_STEPS, **recipe: Any) -> BcNetwork:
     torch.manual_seed(0)
-    settings = {"vision_width": 8, "hidden": (32,), "steps": 1, "batch_size": 8} | recipe
+    settings = {"vision_width": 8, "hidden": (32,), "batch_size": 8} | recipe
     return BcNetwork(BcRecipe(**settings), contract(latent_keys={}, latent_shapes={}), n_action_steps)
 
 

@@ -68,11 +68,22 @@ def test_statistics_count_valid_steps_of_training_episodes_alone(root: Path) -> 
 
 def test_what_a_model_does_not_use_decides_nothing(root: Path) -> None:
     contract = _contract(root, plans=False, low_dim=False, action=False)
-    assert (contract.n_plan_frames, contract.low_dim, contract.action_size) == (0, (), 0)
+    assert (contract.n_plan_frames, contract.max_goal_frames) == (0, None)
+    assert (contract.low_dim, contract.action_size) == ((), 0)
     assert set(contract.normaliser) == {"latents/front", "latents/side"}
-    other = _spec(window={"n_plan_frames": 9})
+    other = _spec(window={"n_plan_frames": 9, "max_goal_frames": 1})
     train = [entry for entry in EpisodeStore(root).index() if entry.id in "ab"]
     contract.require_same(contract.now(root, other, train), where="run")
+
+
+def test_what_an_older_checkpoint_did_not_record_is_not_compared(root: Path) -> None:
+    table = _contract(root).to_json()
+    del table["max_goal_frames"]
+    older, now = DataContract.from_json(table), _contract(root)
+    older.require_same(now, where="run")
+    older.require_same(older.as_said_by(_spec(window={"max_goal_frames": 1})), where="run")
+    with pytest.raises(UsageError, match="max_goal_frames 6 in the model, 1"):
+        now.require_same(now.as_said_by(_spec(window={"max_goal_frames": 1})), where="run")
 
 
 def test_a_channel_that_never_changes_stays_in_its_unit() -> None:
@@ -89,6 +100,7 @@ def test_a_channel_that_never_changes_stays_in_its_unit() -> None:
         ({"rate_hz": 20.0}, r"control rate(.|\n)*10.0 in the model, 20.0"),
         ({"frame_stride": 4}, r"frame_stride 2 in the model, 4(.|\n)*set frame_stride = 2"),
         ({"n_plan_frames": 7}, r"n_plan_frames 6(.|\n)*set n_plan_frames = 6"),
+        ({"max_goal_frames": 2}, r"max_goal_frames 6 in the model, 2(.|\n)*set max_goal_frames = 6"),
         (
             {"latent_keys": {"front": "key-x", "side": "key-b"}},
             r"another VQGAN(.|\n)*front: key-a in the model, front: key-x(.|\n)*vilp-data latents --run(.|\n)*train planner --restart",
@@ -150,3 +162,6 @@ def test_a_model_is_not_judged_by_what_it_was_trained_on(root: Path, tmp_path: P
     refuse_trained_on_validation(state, [entry for entry in entries if entry.id != "a"], where=tmp_path)
     with pytest.raises(SplitError, match=r"policy was trained on 1 of(.|\n)*found: a(.|\n)*train policy --restart"):
         refuse_trained_on_validation(state, entries, where=tmp_path)
+    other_name = [replace(entry, id="z", key="key-a") for entry in entries if entry.id == "b"]
+    with pytest.raises(SplitError, match="found: z"):
+        refuse_trained_on_validation(state, other_name, where=tmp_path)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vilp_models.intervals import mean_estimate, paired_difference, rate_estimate
+from vilp_models.intervals import Estimate, mean_estimate, paired_difference, rate_estimate
 
 
 @pytest.mark.parametrize(
@@ -59,11 +59,18 @@ def test_pairing_sees_a_small_difference_in_values_that_vary_much():
     assert difference.value == pytest.approx(0.1, abs=0.03)
 
 
+def test_an_interval_lies_above_zero_or_below_or_neither():
+    assert (Estimate(1.0, 0.5, 2.0).is_above_zero, Estimate(1.0, 0.5, 2.0).is_below_zero) == (True, False)
+    assert (Estimate(-1.0, -2.0, -0.5).is_above_zero, Estimate(-1.0, -2.0, -0.5).is_below_zero) == (False, True)
+    assert not Estimate(1.0, -0.5, 2.0).is_above_zero
+
+
 def test_one_value_has_a_mean_and_no_interval():
     estimate = mean_estimate([0.5])
     assert estimate.value == 0.5
     assert math.isnan(estimate.low)
     assert not estimate.is_above_zero
+    assert not estimate.is_below_zero
 
 
 def test_what_has_no_interval_is_refused():

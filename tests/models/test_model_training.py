@@ -18,6 +18,7 @@ from vilp_models.curves import FOLDER, Curves, gif
 from vilp_models.model_training import BatchesInOrder, ModelTraining, step_seed
 from vilp_models.optimisation import DivergedError
 from vilp_models.processes import Processes
+from vilp_models.training_state import arrays_of
 from vilp_models.vqgan_training import VqganTraining
 
 
@@ -216,3 +217,16 @@ def test_clips_are_animated(tmp_path: Path) -> None:
     assert (event.step, event.width, event.height) == (3, 12, 8)
     assert event.encoded_image_string == gif(frames)
     assert event.encoded_image_string.startswith(b"GIF89a")
+
+
+def test_what_was_saved_stays_while_training_goes_on() -> None:
+    tensors = {"weight": torch.zeros(3), "turned": torch.zeros(2, 3).t(), "step": torch.zeros(())}
+    arrays = arrays_of(tensors)
+    for tensor in tensors.values():
+        tensor += 1
+    assert all(not array.any() for array in arrays.values())
+
+
+def test_the_device_that_is_named_is_the_one() -> None:
+    assert Processes(device="cuda:1").device == torch.device("cuda:1")
+    assert Processes(device="cpu").device == torch.device("cpu")

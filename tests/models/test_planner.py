@@ -16,7 +16,7 @@ from vilp_models.unet3d import CrossAttention, OneTokenAttention, UNet3d
 VIEWS = ("side", "top")
 SMALL = {
     "width": 16, "multipliers": (1, 2), "blocks": 1, "groups": 8, "convolutions": "factorised", "vision_width": 4,
-    "steps": 10, "batch_size": 2,
+    "batch_size": 2,
 }  # fmt: skip
 CONDITIONS = ["token", "tokens", "concat", "token+concat", "tokens+concat"]
 
@@ -71,6 +71,14 @@ def plain(model):
             if isinstance(child, OneTokenAttention):
                 setattr(module, name, child.as_full())
     return model
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "dpm++"])
+def test_more_denoising_steps_than_noise_levels_are_refused(sampler):
+    model = planner()
+    levels = model.recipe.train_steps
+    with pytest.raises(UsageError, match=rf"{levels + 1} denoising steps(.|\n)*at most {levels}"):
+        imagined(model, batch(1), steps=levels + 1, sampler=sampler)
 
 
 @pytest.mark.parametrize("condition", ["token", "token+concat"])

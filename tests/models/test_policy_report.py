@@ -38,6 +38,7 @@ fields = ["[0:2]"]
 topic = "/action"
 fields = ["[0:2]"]
 unit = "px"
+holds = "agent"
 """
 STRIDE = 2
 MEAN = (0.5, -0.5)
@@ -90,7 +91,7 @@ def answers(store: EpisodeStore, *, reconstructed: bool = False) -> dict[bytes, 
 def report_of(store: EpisodeStore, policy: Known, *, decoded: bool = True) -> PolicyReport:
     keys = {"front": ENCODER.key}
     pairs = PairDataset(store.root, split="all", frame_stride=STRIDE, latent_keys=keys)
-    return policy_report(store, policy, pairs, MEAN, decoders={"front": ENCODER} if decoded else None)
+    return policy_report(store, store.spec(), policy, pairs, MEAN, decoders={"front": ENCODER} if decoded else None)
 
 
 def test_a_policy_that_knows_the_action_makes_no_error_and_beats_every_guess(dataset: EpisodeStore) -> None:
@@ -142,7 +143,7 @@ def test_a_policy_no_better_than_a_guess_is_said_so(dataset: EpisodeStore, tmp_p
     assert "**Warning:** do not act" in (tmp_path / "evaluation" / "report.md").read_text()
 
 
-def test_staying_is_no_motion_for_deltas_and_the_named_low_dim_or_the_last_command_else() -> None:
+def test_staying_is_no_motion_for_deltas_the_low_dim_that_the_task_tells_or_the_last_command() -> None:
     spec = TaskSpec.model_validate(
         {
             "name": "arm",
@@ -155,9 +156,14 @@ def test_staying_is_no_motion_for_deltas_and_the_named_low_dim_or_the_last_comma
                 "move": {"topic": "/move", "fields": ["dx", "dy"], "kind": "delta"},
                 "grip": {"topic": "/grip", "fields": ["close"]},
                 "reach": {"from": "pose", "fields": ["x", "y"]},
+                "finger": {"topic": "/gripper", "fields": ["width"]},
+                "aim": {"topic": "/aim", "fields": ["x", "y"]},  # the fields of pose, but nobody says its place
+                "target": {"topic": "/target", "fields": ["a", "b"], "holds": "pose"},
+                "wider": {"topic": "/wider", "fields": ["a", "b", "c"], "holds": "pose"},
             },
         }
     )
     low_dim = np.array([[1, 2, 9]], np.float32)
-    last = np.array([[5, 6, 7, 3, 4]], np.float32)
-    assert hold_actions(spec, low_dim, last).tolist() == [[0, 0, 7, 1, 2]]
+    last = np.arange(10, 23, dtype=np.float32)[None]
+    parts = np.split(hold_actions(spec, low_dim, last)[0], [2, 3, 5, 6, 8, 10])
+    assert [part.tolist() for part in parts] == [[0, 0], [12], [1, 2], [9], [16, 17], [1, 2], [20, 21, 22]]

@@ -3,9 +3,22 @@ from __future__ import annotations
 import pytest
 
 from vilp_data.errors import SpecError, UsageError
-from vilp_data.spec import PRESETS, load_task, parse_task
-from vilp_models.recipe import VQGAN_PRESETS, VqganRecipe, vqgan_recipe
+from vilp_data.spec import PRESETS, Frozen, load_task, parse_task, task_names
+from vilp_models.recipe import (
+    VQGAN_PRESETS,
+    BcRecipe,
+    PlannerRecipe,
+    PolicyRecipe,
+    VilpRecipe,
+    VqganRecipe,
+    load_recipe,
+    vqgan_recipe,
+)
 from vilp_models.vqgan import build_vqgan
+
+KINDS: dict[str, type[Frozen]] = {
+    "vqgan": VqganRecipe, "planner": PlannerRecipe, "policy": PolicyRecipe, "bc": BcRecipe, "vilp": VilpRecipe,
+}  # fmt: skip
 
 
 def test_the_default_is_the_papers_network() -> None:
@@ -60,8 +73,24 @@ def test_every_preset_of_tasks_has_a_recipe_and_no_other_does() -> None:
         vqgan_recipe({}, preset="tinny", where="x")
 
 
-@pytest.mark.parametrize(("task", "steps"), [("hanoi", 4000), ("pusht", 3000)])
+@pytest.mark.parametrize(("task", "steps"), [("hanoi", 4000), ("pusht", 7000)])
 def test_the_built_in_tasks_differ_in_what_their_toml_says_alone(task: str, steps: int) -> None:
     recipe = vqgan_recipe(load_task(task, preset="cpu").models, preset="cpu", where=task)
     assert recipe.model_copy(update={"steps": 4000}) == vqgan_recipe({}, preset="cpu", where="any")
     assert recipe.steps == steps
+
+
+@pytest.mark.parametrize("kind", [VqganRecipe, PlannerRecipe, PolicyRecipe, BcRecipe])
+def test_a_warm_up_that_outlasts_training_is_refused(kind: type[Frozen]) -> None:
+    changes = {"steps": 100, "warmup_steps": 101}
+    with pytest.raises(ValueError, match="warmup_steps = 101 must be at most steps = 100"):
+        kind.model_validate(changes)
+    assert kind.model_validate({**changes, "warmup_steps": 100})
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("task", task_names())
+def test_every_preset_of_every_task_is_a_recipe(task: str, preset: str) -> None:
+    models = load_task(task, preset=preset).models
+    for name, kind in KINDS.items():
+        assert load_recipe(kind, name, models, preset=preset, where=task)

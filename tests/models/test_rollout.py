@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +13,8 @@ import pytest
 pytest.importorskip("gymnasium", reason="the simulators are not installed: make setup")
 
 from tests.models.toy_simulator import GOAL, dot_task
+from tests.stored_episodes import add_episodes
+from tests.stored_episodes import episode as random_episode
 from vilp_data.assemble import assemble_episode
 from vilp_data.dataset_split import find_split, side_episodes, update_split
 from vilp_data.episodes import EpisodeStore
@@ -26,7 +28,7 @@ from vilp_models.policies.base import Observation
 from vilp_models.policies.recorded import RecordedPolicy
 from vilp_models.policies.stay import StayPolicy
 from vilp_models.rollout import LogPlan, roll_out
-from vilp_models.rollout_report import log_film, read_rollout, roll_out_into
+from vilp_models.rollout_report import format_rollout, log_film, read_rollout, roll_out_into
 from vilp_models.starts import Recording, Start, episode_starts, parse_seeds, seed_starts
 
 
@@ -142,6 +144,19 @@ def test_a_log_reads_back_as_what_was_seen_and_done(spec: TaskSpec, tmp_path: Pa
     tags = episode.tags
     assert (tags["policy"], tags["source"], tags["success"]) == ("random", "rollout", str(results[0].success).lower())
     assert float(tags["max_reward"]) == pytest.approx(results[0].max_reward, rel=1e-5)
+    assert (tags["seed"], tags["policy_seed"]) == ("3", "3")
+
+
+@pytest.mark.parametrize("reset_seed", [7, None])
+def test_a_log_tells_the_seed_of_the_environment_from_that_of_the_policy(
+    spec: TaskSpec, tmp_path: Path, reset_seed: int | None
+) -> None:
+    start = Start("a", 1234, reset_seed, np.array([0.5, 0.0]))
+    roll_out(spec, RandomPolicy(), [start], max_steps=3, environments=1, logs=LogPlan(tmp_path, {}))
+    with open_log(tmp_path / "a.mcap") as log:
+        tags = log.episodes()[0].tags
+    assert tags["policy_seed"] == "1234"
+    assert tags.get("seed") == (None if reset_seed is None else "7")
 
 
 def test_ingest_leaves_a_policys_episodes_out_and_no_side_ever_has_them(spec: TaskSpec, tmp_path: Path) -> None:
@@ -227,39 +242,126 @@ def against(folder: Path, spec: TaskSpec, seeds: range, *, max_steps: int) -> No
     )  # fmt: skip
 
 
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
 def test_a_rollout_leaves_logs_and_three_videos_and_replaces_what_was_there(spec: TaskSpec, tmp_path: Path) -> None:
-    stayed(tmp_path, spec, range(5))
-    assert len(list(tmp_path.glob("logs/*.mcap"))) == 5
-    stayed(tmp_path, spec, range(3))
-    assert sorted(path.stem for path in tmp_path.glob("logs/*.mcap")) == ["seed0000000", "seed0000001", "seed0000002"]
-    assert sorted(path.name for path in tmp_path.glob("videos/*")) == ["best.mp4", "median.mp4", "worst.mp4"]
-    frames, fps = log_film(tmp_path / "logs" / "seed0000000.mcap", spec)
+    folder = tmp_path / "stay"
+    stayed(folder, spec, range(5))
+    assert len(list(folder.glob("logs/*.mcap"))) == 5
+    stayed(folder, spec, range(3))
+    assert sorted(path.stem for path in folder.glob("logs/*.mcap")) == ["seed0000000", "seed0000001", "seed0000002"]
+    assert sorted(path.name for path in folder.glob("videos/*")) == ["best.mp4", "median.mp4", "worst.mp4"]
+    assert list(tmp_path.iterdir()) == [folder]
+    frames, fps = log_film(folder / "logs" / "seed0000000.mcap", spec)
     assert frames.shape == (21, 8, 12, 3)
     assert fps == pytest.approx(10)
 
 
-def test_a_rollout_that_is_stopped_leaves_no_report_and_no_half_a_log(spec: TaskSpec, tmp_path: Path) -> None:
-    stayed(tmp_path, spec, range(3))
-
+@pytest.mark.parametrize("error", [KeyboardInterrupt, UsageError("broken")])
+def test_a_rollout_that_is_stopped_leaves_nothing_and_the_earlier_one_as_it_was(
+    spec: TaskSpec, tmp_path: Path, error: BaseException
+) -> None:
     class Stopped(RandomPolicy):
         def act(self, observation: Observation) -> F32:
             if self.seen:
-                raise KeyboardInterrupt
+                raise error
             return super().act(observation)
 
-    with pytest.raises(KeyboardInterrupt):
-        roll_out_into(
-            tmp_path, spec, Stopped(), seed_starts(range(3)), name="p", what="x", max_steps=20, environments=3
-        )
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    def stopped(folder: Path) -> None:
+        starts = seed_starts(range(3))
+        with pytest.raises((KeyboardInterrupt, UsageError)):
+            roll_out_into(folder, spec, Stopped(), starts, name="p", what="x", max_steps=20, environments=3)
+
+    stayed(tmp_path / "earlier", spec, range(3))
+    before = files(tmp_path)
+    stopped(tmp_path / "earlier")
+    stopped(tmp_path / "new")
+    assert files(tmp_path) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["earlier"]
     with pytest.raises(UsageError, match="no finished rollout"):
-        read_rollout(tmp_path)
+        read_rollout(tmp_path / "new")
+
+
+def demonstrations(folder: Path, spec: TaskSpec) -> None:
+    (folder / "logs").mkdir(parents=True)
+    (folder / "logs" / "demo.mcap").write_bytes(b"what a person did")
+
+
+def a_dataset(folder: Path, spec: TaskSpec) -> None:
+    EpisodeStore(folder).write_spec(spec)
+
+
+def another_report(folder: Path, spec: TaskSpec) -> None:
+    folder.mkdir(parents=True)
+    (folder / "report.json").write_text('{"inputs": {}, "episodes": []}')
+
+
+def a_rollout_with_demonstrations(folder: Path, spec: TaskSpec) -> None:
+    stayed(folder, spec, range(1))
+    (folder / "logs" / "demo.mcap").write_bytes(b"what a person did")
+
+
+def a_file(folder: Path, spec: TaskSpec) -> None:
+    folder.write_text("notes")
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (demonstrations, r"this is something else(.|\n)*logs/demo.mcap"),
+        (a_dataset, "cannot take the place of a dataset"),
+        (another_report, r"this is something else(.|\n)*report.json"),
+        (a_rollout_with_demonstrations, r"not its own lie beside it(.|\n)*logs/demo.mcap"),
+        (a_file, "this is something else"),
+    ],
+)
+def test_nothing_but_a_rollout_is_replaced(
+    spec: TaskSpec, tmp_path: Path, made: Callable[[Path, TaskSpec], None], words: str
+) -> None:
+    made(tmp_path / "there", spec)
+    before = files(tmp_path)
+    with pytest.raises(UsageError, match=words):
+        stayed(tmp_path / "there", spec, range(1))
+    assert files(tmp_path) == before
+
+
+def test_a_rollout_may_fill_an_empty_folder(spec: TaskSpec, tmp_path: Path) -> None:
+    stayed(tmp_path, spec, range(1))
+    assert read_rollout(tmp_path)["policy"] == "stay"
+
+
+@pytest.mark.parametrize(("n_starts", "videos"), [(1, {"best"}), (2, {"best", "worst"})])
+def test_no_episode_is_filmed_twice(spec: TaskSpec, tmp_path: Path, n_starts: int, videos: set[str]) -> None:
+    stayed(tmp_path, spec, range(n_starts))
+    assert {path.stem for path in tmp_path.glob("videos/*")} == videos
 
 
 def test_a_single_start_has_no_interval_and_is_still_valid_json(spec: TaskSpec, tmp_path: Path) -> None:
     stayed(tmp_path, spec, range(1))
     table = json.loads((tmp_path / "report.json").read_text())
     assert table["max_reward"]["low"] is None
+    assert "stay on 1 start (x)" in format_rollout(table, tmp_path)[0]
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        ((0.3, 0.1, 0.5), "+0.300 (+0.100 to +0.500): above"),
+        ((-0.3, -0.5, -0.1), "-0.300 (-0.500 to -0.100): below"),
+        ((0.3, -0.1, 0.5), "+0.300 (-0.100 to +0.500)"),
+        ((0.3, None, None), "+0.300"),
+    ],
+)
+def test_a_difference_is_called_above_or_below_only_where_its_interval_is(
+    spec: TaskSpec, tmp_path: Path, interval: tuple[float | None, ...], words: str
+) -> None:
+    stayed(tmp_path, spec, range(1))
+    estimate = dict(zip(("value", "low", "high"), interval, strict=True))
+    table = read_rollout(tmp_path) | {"against": [{"policy": "other", "max_reward": estimate, "success": estimate}]}
+    [line] = [line for line in format_rollout(table, tmp_path) if "against" in line]
+    assert line.endswith(words)
 
 
 # --- starts ---
@@ -285,11 +387,30 @@ def test_recorded_actions_lead_from_the_recorded_start_to_the_recorded_end(spec:
         retag(store, result.name)
     starts, recordings = episode_starts(store, "all", limit=2)
     assert [start.name for start in starts] == ["seed0000000", "seed0000001"]
+    assert [start.reset_seed for start in starts] == [0, 1]
     policy = RecordedPolicy(recordings, n_action_steps=4)
     replayed, _ = roll_out(spec, policy, starts, max_steps=20, environments=2)
     assert [r.max_reward for r in replayed] == pytest.approx([r.max_reward for r in results[:2]])
     with pytest.raises(UsageError, match="did you mean 'val'"):
         episode_starts(store, "vall")
+
+
+def test_the_seed_of_a_recorded_start_stays_when_episodes_are_added(tmp_path: Path) -> None:
+    def seeds() -> dict[str, int]:
+        starts, recordings = episode_starts(EpisodeStore(tmp_path), "all")
+        for start in starts:
+            assert start.state is not None
+            np.testing.assert_array_equal(recordings[start.policy_seed].state[0], start.state)
+        return {start.name: start.policy_seed for start in starts}
+
+    EpisodeStore(tmp_path).write_spec(dot_task())
+    state = np.arange(20.0).reshape(10, 2)
+    add_episodes(tmp_path, *(replace(random_episode(name, 10), state=state + ord(name)) for name in "bd"))
+    before = seeds()
+    add_episodes(tmp_path, *(replace(random_episode(name, 10), state=state + ord(name)) for name in "ac"))
+    after = seeds()
+    assert {name: after[name] for name in "bd"} == before
+    assert len(set(after.values())) == 4
 
 
 def recording(n_steps: int) -> Recording:

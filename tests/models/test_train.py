@@ -4,18 +4,21 @@ import json
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from tests.models.conftest import HEIGHT, WIDTH, tiny_recipe
+from tests.models.tiny_training import in_two_processes
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, StoreError, UsageError
 from vilp_data.shards import open_shard, read_shard, write_shard, writer_lock
 from vilp_data.spec import TaskSpec
 from vilp_models.checkpoint import FILE, load_checkpoint, model_tensors, read_state, run_folder
 from vilp_models.optimisation import DivergedError
+from vilp_models.processes import Processes
 from vilp_models.recipe import VqganRecipe
 from vilp_models.train import train_vqgan
 from vilp_models.vqgan import load_frame_encoder
@@ -28,7 +31,7 @@ def run_dir(tmp_path: Path) -> Path:
 
 
 def _train(
-    store: EpisodeStore, spec: TaskSpec, recipe: VqganRecipe, run_dir: Path, episodes: str = "abc", **options: bool
+    store: EpisodeStore, spec: TaskSpec, recipe: VqganRecipe, run_dir: Path, episodes: str = "abc", **options: Any
 ) -> None:
     train_vqgan(store.root, spec, recipe, run_dir, train_episodes=list(episodes), split_hash="s", show=False, **options)
 
@@ -131,6 +134,59 @@ def test_another_recipe_or_lost_episodes_are_refused_unless_restarted(
         _train(store, spec, tiny_recipe(), run_dir, "ab")
     _train(store, spec, tiny_recipe(), run_dir, "ab", restart=True)
     assert load_frame_encoder(run_dir, "front").trained_on == {"key-a", "key-b"}
+
+
+def test_a_restart_that_fails_leaves_the_trained_network(
+    store: EpisodeStore, spec: TaskSpec, run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _train(store, spec, tiny_recipe(share_views=True), run_dir)
+    path = run_folder(run_dir, ("front", "side")) / FILE
+    good = path.read_bytes()
+    with pytest.raises(UsageError):  # crops larger than the frames
+        _train(store, spec, tiny_recipe(share_views=True, crop=64), run_dir, restart=True)
+    assert path.read_bytes() == good
+    with monkeypatch.context() as patch:
+        _interrupt_at(patch, 0, DivergedError)
+        with pytest.raises(DivergedError):
+            _train(store, spec, tiny_recipe(share_views=True), run_dir, restart=True)
+    assert path.read_bytes() == good
+    _train(store, spec, tiny_recipe(share_views=True, seed=1), run_dir, restart=True)
+    assert path.read_bytes() != good
+    restarted = path.read_bytes()
+    _train(store, spec, tiny_recipe(share_views=True, seed=1), run_dir / "fresh")
+    assert (run_folder(run_dir / "fresh", ("front", "side")) / FILE).read_bytes() == restarted
+
+
+def test_a_recipe_key_that_came_later_is_no_other_recipe(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    recipe = tiny_recipe(share_views=True)
+    _train(store, spec, recipe, run_dir)
+    path = run_folder(run_dir, ("front", "side")) / FILE
+    shard = read_shard(path)
+    stored = json.loads(shard.metadata["recipe"])
+    del stored["restart_every"], stored["crop"]  # crop's default is this recipe's, restart_every's is not
+    header = {"format": shard.metadata["format"], "state": shard.metadata["state"], "recipe": json.dumps(stored)}
+    write_shard(path, dict(shard.arrays), header)
+    with pytest.raises(UsageError, match=r"found: restart_every = 200 there, 2 now\n"):
+        _train(store, spec, recipe, run_dir)
+    stored["restart_every"] = recipe.restart_every
+    write_shard(path, dict(shard.arrays), {**header, "recipe": json.dumps(stored)})
+    trained = path.read_bytes()
+    _train(store, spec, recipe, run_dir)
+    assert path.read_bytes() == trained
+
+
+def test_every_process_hears_that_a_run_is_busy(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:
+    def task(_: Processes) -> dict[str, np.ndarray]:
+        signal.alarm(60)  # one that waits for ever fails
+        try:
+            _train(store, spec, tiny_recipe(), run_dir, device="cpu")
+        except BusyError:
+            return {"busy": np.ones(1)}
+        return {"busy": np.zeros(1)}
+
+    with writer_lock(run_folder(run_dir, ("front",))):
+        answers = in_two_processes(task, run_dir / "answers")
+    assert [answer["busy"].item() for answer in answers] == [1, 1]
 
 
 def test_a_run_that_another_process_trains_is_busy(store: EpisodeStore, spec: TaskSpec, run_dir: Path) -> None:

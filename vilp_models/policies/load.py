@@ -7,13 +7,20 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
+from vilp_data.dataset_split import read_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError, nearest
 from vilp_data.spec import TaskSpec
 from vilp_data.types import F32, U8
+from vilp_models.checkpoint import checkpoint_digest, run_for_view
+from vilp_models.planner import Sampler
 from vilp_models.policies.base import Policy
+from vilp_models.recipe import Precision
+from vilp_models.runs import find_model_run
 from vilp_models.starts import Recording
-from vilp_models.vqgan import VqganEncoder, load_frame_encoder
+from vilp_models.vqgan import VqganEncoder
 
 DIGITS = 16
 """Of a checkpoint's digest, as reports and logs name it."""
@@ -21,8 +28,14 @@ DIGITS = 16
 
 @dataclass(frozen=True)
 class PolicyRequest:
-    """What a policy is loaded from. `preset` chooses the runs (runs/policy-PRESET, …), None the only ones there are;
-    `recordings` are those that episodes start from, by seed; none where the simulator draws the starts."""
+    """What a policy is loaded from. `preset` chooses the runs (runs/policy-PRESET, …), None the only ones there are.
+
+    device      where all of its networks run
+    recordings  those that episodes start from, by policy seed; none where the simulator draws the starts
+    vqgan       the run of the VQGANs, where another than the preset's
+    denoising_steps, sampler, precision
+                of a policy that imagines, as `VilpPolicy` takes them
+    """
 
     root: Path
     spec: TaskSpec
@@ -30,25 +43,33 @@ class PolicyRequest:
     n_action_steps: int
     device: str = "cpu"
     recordings: Mapping[int, Recording] = field(default_factory=dict)
+    vqgan: Path | None = None
+    denoising_steps: int | None = None
+    sampler: Sampler | None = None
+    precision: Precision = "f32"
 
     def run_dir(self, kind: str) -> Path:
-        """Folder of the runs of one kind of model. Raises UsageError where it is not clear which."""
-        if self.preset is not None:
-            return self.root / "runs" / f"{kind}-{self.preset}"
-        there = sorted(path for path in (self.root / "runs").glob(f"{kind}-*") if path.is_dir())
-        if len(there) != 1:
-            raise UsageError(
-                f"which {kind}?",
-                where=self.root / "runs",
-                found=", ".join(path.name for path in there) or "none",
-                remedy=f"choose with --preset, or train one: `vilp-models train {kind}`",
-            )
-        return there[0]
+        """Folder of the runs of one kind of model. Raises UsageError where there is none, or it is not clear which."""
+        if kind == "vqgan":
+            return find_model_run(self.root, kind, given=self.vqgan, preset=self.preset, option="--vqgan")
+        return find_model_run(self.root, kind, preset=self.preset, option="--preset")
+
+    def tags(self, **checkpoints: str) -> dict[str, str]:
+        """What was run, for report and logs: digests, cut short, and the split that the models' episodes were checked against."""
+        digests = {name: digest[:DIGITS] for name, digest in checkpoints.items()}
+        return {**digests, "split": read_split(self.root).hash[:DIGITS]}
+
+    def vqgan_checkpoints(self) -> dict[str, str]:
+        """Tag -> digest of each view's VQGAN, decoder and codebook included, which latents do not tell apart."""
+        run = self.run_dir("vqgan")
+        views = sorted(self.spec.views)
+        return {f"vqgan_checkpoint_{view}": checkpoint_digest(run_for_view(run, view)) for view in views}
 
     def encoders(self) -> dict[str, VqganEncoder]:
-        """The VQGAN of each view. Raises UsageError where one is not trained."""
-        run = self.run_dir("vqgan")
-        return {view: load_frame_encoder(run, view) for view in sorted(self.spec.views)}
+        """The VQGAN of each view. Raises UsageError where one is not trained, SplitError where one knows validation episodes."""
+        from vilp_models.trained import load_encoders
+
+        return load_encoders(EpisodeStore(self.root), self.spec, self.run_dir("vqgan"), device=self.device)
 
 
 def load_policy(name: str, request: PolicyRequest) -> Policy:
@@ -84,15 +105,18 @@ def _oracle(request: PolicyRequest) -> Policy:
 
     store, encoders = EpisodeStore(request.root), request.encoders()
     trained = load_low_level(store, request.spec, request.run_dir("policy"), encoders, device=request.device)
-    encode = partial(_latents, encoders) if trained.recipe.sees == "latents" else None
-    tags = {"policy_checkpoint": trained.digest[:DIGITS]}
+    encodes = trained.recipe.sees == "latents"
+    encode = partial(_latents, encoders) if encodes else None
+    vqgans = request.vqgan_checkpoints() if encodes else {}
+    tags = request.tags(policy_checkpoint=trained.digest, **vqgans)
     return OraclePolicy(
         trained.policy, request.recordings, n_action_steps=request.n_action_steps, encode=encode, tags=tags
     )
 
 
 def _latents(encoders: Mapping[str, VqganEncoder], view: str, frames: U8) -> F32:
-    return encoders[view].encode_f32(frames)
+    """Rounded as the latents that were trained on."""
+    return encoders[view].encode(frames).astype(np.float32)
 
 
 def _bc(request: PolicyRequest) -> Policy:
@@ -103,7 +127,7 @@ def _bc(request: PolicyRequest) -> Policy:
         EpisodeStore(request.root), request.spec, request.run_dir("bc"), n_action_steps=request.n_action_steps,
         device=request.device,
     )  # fmt: skip
-    return BcPolicy(trained.network, tags={"bc_checkpoint": trained.digest[:DIGITS]})
+    return BcPolicy(trained.network, tags=request.tags(bc_checkpoint=trained.digest))
 
 
 def _vilp(request: PolicyRequest) -> Policy:
@@ -115,10 +139,16 @@ def _vilp(request: PolicyRequest) -> Policy:
         store, request.spec, request.run_dir("planner"), request.run_dir("vqgan"), device=request.device
     )
     low_level = load_low_level(store, request.spec, request.run_dir("policy"), planned.encoders, device=request.device)
-    tags = {"policy_checkpoint": low_level.digest[:DIGITS]}
-    tags |= {f"planner_checkpoint_{view}": digest[:DIGITS] for view, digest in planned.digests.items()}
+    planners = {f"planner_checkpoint_{view}": digest for view, digest in planned.digests.items()}
     return VilpPolicy(
-        planned.planners, planned.encoders, low_level.policy, n_action_steps=request.n_action_steps, tags=tags
+        planned.planners,
+        planned.encoders,
+        low_level.policy,
+        n_action_steps=request.n_action_steps,
+        denoising_steps=request.denoising_steps,
+        sampler=request.sampler,
+        precision=request.precision,
+        tags=request.tags(policy_checkpoint=low_level.digest, **planners, **request.vqgan_checkpoints()),
     )
 
 

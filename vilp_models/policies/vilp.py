@@ -44,10 +44,12 @@ class VilpPolicy:
         decode_all: bool = False,
         tags: Mapping[str, str] | None = None,
     ) -> None:
-        """`denoising_steps` and `sampler` are the planners' recipes' unless told otherwise; `precision` is of denoising.
-        `decode_all` decodes frames that nobody looks at too: the plain way, to measure against.
+        """`denoising_steps` and `sampler` are the planners' recipes' unless told otherwise; `precision` is of all but encoding.
+        `decode_all` decodes frames that nobody looks at too: the plain way, to measure against. `tags` say which checkpoints these
+        are; how they sample is added.
 
-        Raises UsageError where the planned frames do not reach as far as n_action_steps."""
+        Raises UsageError for more denoising steps than there are noise levels, where the planned frames do not reach as far as
+        n_action_steps, and for a low-level policy that wants to know low_dim at frames that are only imagined."""
         first = next(iter(planners.values()))
         self.n_pairs = -(-n_action_steps // low_level.frame_stride)
         if self.n_pairs > first.n_plan_frames:
@@ -56,10 +58,23 @@ class VilpPolicy:
                 found=f"n_action_steps = {n_action_steps}, {first.n_plan_frames} frames of {low_level.frame_stride} steps",
                 remedy=f"set models.vilp.n_action_steps to at most {first.n_plan_frames * low_level.frame_stride}",
             )
+        if low_level.low_dim is not None and self.n_pairs > 1:
+            raise UsageError(
+                "this low-level policy was trained with low_dim, which nobody knows at imagined frames",
+                remedy="train it with models.policy.low_dim = false, or plan anew after each pair "
+                f"(models.vilp.n_action_steps = {low_level.frame_stride})",
+            )
         self.planners = {view: planner.eval() for view, planner in planners.items()}
         self.encoders, self.low_level = dict(encoders), low_level.eval()
         self.n_action_steps = n_action_steps
-        self.tags: Mapping[str, str] = dict(tags or {})
+        n_steps = {planner.denoising_steps(denoising_steps) for planner in planners.values()}
+        samplers = {sampler or planner.recipe.sampler for planner in planners.values()}
+        self.tags: Mapping[str, str] = {
+            **(tags or {}),
+            "denoising_steps": ", ".join(map(str, sorted(n_steps))),
+            "sampler": ", ".join(sorted(samplers)),
+            "precision": precision,
+        }
         self.device = low_level.action.mean.device
         self._steps, self._sampler, self._precision = denoising_steps, sampler, precision
         self._n_decoded = first.n_plan_frames if decode_all else self.n_pairs
@@ -91,9 +106,9 @@ class VilpPolicy:
         if self._sees_latents:
             film = {view: torch.cat([present[view][:, None].float(), clip], dim=1) for view, clip in imagined.items()}
         else:
-            with self._timed("decode"):
+            with self._timed("decode"), self._autocast():
                 film = {view: self._decoded(view, frames[view], clip) for view, clip in imagined.items()}
-        with self._timed("act"):
+        with self._timed("act"), self._autocast():
             actions = self._actions(film, low_dim).cpu().numpy()
         self._n_plans += 1
         return actions

@@ -1,0 +1,165 @@
+"""`vilp-models rollout`: a policy in the simulator, or the proof that a dataset replays."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from vilp_data.cli import JsonOption, PresetOption, print_json, progress_bar
+from vilp_data.episodes import EpisodeStore
+from vilp_data.spec import TaskSpec
+from vilp_models.cli.options import (
+    DataOption,
+    DenoisingStepsOption,
+    SamplerOption,
+    TaskOption,
+    VqganOption,
+    dataset_of,
+)
+
+
+def rollout(
+    task: TaskOption = None,
+    preset: PresetOption = None,
+    data: DataOption = None,
+    policy: Annotated[
+        str, typer.Option(help="replay, stay, oracle (true future frames), vilp or bc; see below.")
+    ] = "replay",
+    seeds: Annotated[
+        str | None,
+        typer.Option(help="Simulator's starts FIRST:END, without END itself. Default: 0:50.", show_default=False),
+    ] = None,
+    from_episodes: Annotated[
+        str | None,
+        typer.Option(
+            help="Start at the first recorded state of episodes: val, train or all. Default for oracle: val.",
+            show_default=False,
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="How many of the dataset's episodes. Default: all.", show_default=False)
+    ] = None,
+    envs: Annotated[int, typer.Option(min=1, help="Environments that are planned for together.")] = 50,
+    max_steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps of an episode. Default: the task's.", show_default=False)
+    ] = None,
+    against: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A finished rollout of the same starts to compare with. Default: that of stay, if any.",
+            show_default=False,
+        ),
+    ] = None,
+    logs: Annotated[
+        bool, typer.Option("--logs/--no-logs", help="Write an MCAP log of each episode, and videos.")
+    ] = True,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder. Default: DATA/rollouts/POLICY-PRESET-SETTINGS-STARTS.", show_default=False),
+    ] = None,
+    vqgan: VqganOption = None,
+    denoising_steps: DenoisingStepsOption = None,
+    sampler: SamplerOption = None,
+    precision: Annotated[
+        Literal["f32", "bf16"],
+        typer.Option(help="What imagining computes in; encoding is always as latents were made."),
+    ] = "f32",
+    device: Annotated[
+        str | None,
+        typer.Option(help="Where networks run. Default: an accelerator if there is one.", show_default=False),
+    ] = None,
+    render: Annotated[
+        bool, typer.Option("--render", help="Replay: also draw the recorded states and compare with the stored frames.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Let a policy act in the simulator, and report mean of max reward and success rate with 95 % intervals.
+
+    `--policy replay` alone proves the dataset instead: recorded actions must bring the recorded states back. With
+    --from-episodes it is a policy like the others. Tune on seeds 0:50; report 100000:100050, once.
+
+    Example: vilp-models rollout --data data/pusht --policy vilp --preset cpu --seeds 100000:100050
+    """
+    root, spec = dataset_of(data, task, preset)
+    if policy == "replay" and seeds is None and from_episodes is None:
+        _prove_replay(root, spec, episodes=episodes, render=render, as_json=as_json)
+        return
+    from vilp_data.errors import UsageError
+    from vilp_models.policies.load import FOLLOWS_RECORDINGS, HAS_MODELS, PolicyRequest, load_policy
+    from vilp_models.recipe import VilpRecipe, load_recipe
+    from vilp_models.rollout_report import finished_rollout, format_rollout, read_rollout, roll_out_into
+    from vilp_models.simulator import require_simulator
+    from vilp_models.starts import episode_starts, parse_seeds, seed_starts
+    from vilp_models.trained import default_device
+
+    if seeds is not None and (from_episodes is not None or episodes is not None):
+        raise UsageError("episodes start at seeds or at recorded states, not both", remedy="leave one of them out")
+    n_steps = max_steps or require_simulator(spec).max_steps
+    if seeds is None and (from_episodes is not None or policy in FOLLOWS_RECORDINGS):
+        side = from_episodes or "val"
+        starts, recordings = episode_starts(EpisodeStore(root), side, limit=episodes)
+        what = side if episodes is None else f"{side}-{len(starts)}"
+    else:
+        what = seeds or "0:50"
+        starts, recordings = seed_starts(parse_seeds(what)), {}
+    settings = _settings(denoising_steps, sampler, precision)
+    if settings and policy != "vilp":
+        remedy = "leave --denoising-steps, --sampler and --precision out, or roll out vilp"
+        raise UsageError(f"the policy {policy!r} imagines nothing", found=", ".join(settings), remedy=remedy)
+    recipe = load_recipe(VilpRecipe, "vilp", spec.models, preset=preset, where=spec.name)
+    request = PolicyRequest(
+        root, spec, preset, recipe.n_action_steps, device=device or default_device(), recordings=recordings,
+        vqgan=vqgan, denoising_steps=denoising_steps, sampler=sampler, precision=precision,
+    )  # fmt: skip
+    acting = load_policy(policy, request)
+    models = [*([preset] if preset else []), *([vqgan.name] if vqgan else [])] if policy in HAS_MODELS else []
+    label = what.replace(":", "-")
+    folder = out or root / "rollouts" / "-".join([policy, *models, *settings, label])
+    stay = root / "rollouts" / f"stay-{label}"
+    if against is None:
+        names = [start.name for start in starts]
+        against = [stay] if finished_rollout(stay, task=spec.name, max_steps=n_steps, names=names) else []
+    with progress_bar(f"rolling out {policy}", len(starts) * n_steps) as advance:
+        roll_out_into(
+            folder, spec, acting, starts, name=policy, what=what, max_steps=n_steps, environments=envs,
+            against=[other for other in against if other != folder], with_logs=logs, progress=advance,
+        )  # fmt: skip
+    table = read_rollout(folder)
+    print_json(table) if as_json else print("\n".join(format_rollout(table, folder)))
+
+
+def _settings(denoising_steps: int | None, sampler: str | None, precision: str) -> list[str]:
+    """What was asked for beside the recipe, as a folder's name tells it."""
+    steps = [] if denoising_steps is None else [f"{denoising_steps}step{'' if denoising_steps == 1 else 's'}"]
+    return [*steps, *([sampler] if sampler else []), *([precision] if precision != "f32" else [])]
+
+
+def _prove_replay(root: Path, spec: TaskSpec, *, episodes: int | None, render: bool, as_json: bool) -> None:
+    from vilp_models.replay import format_render, format_replay, render_match, replay
+    from vilp_models.simulator import make_env
+
+    store = EpisodeStore(root)
+    env = make_env(spec, cameras=render)
+    tolerance = env.metadata.get("replay_tolerance")
+    reports, failed = [], 0
+    for entry in store.index()[:episodes]:
+        episode = store.read(entry.id)
+        report = replay(episode, env)
+        reports.append(dataclasses.asdict(report))
+        failed += tolerance is not None and not report.proves(tolerance)
+        lines = format_replay(report, tolerance=tolerance)
+        if render:
+            match = render_match(episode, env)
+            failed += not match.proves()
+            lines += format_render(match)
+            reports[-1]["render"] = dataclasses.asdict(match)
+        if not as_json:
+            print("\n".join(lines))
+    env.close()
+    if as_json:
+        print_json(reports)
+    if failed:
+        raise typer.Exit(1)
