@@ -311,6 +311,6 @@ def test_only_episodes_with_actions_where_a_model_learns_actions(root: Path) -> 
     batch = dataset.read(range(len(dataset)))
     assert set(batch.episode.tolist()) == {0, 1, 2}
     assert batch.action_mask[:, 0].all()
-    write_dataset(root / "mute", episode("b", 9, with_action=False))
+    write_dataset(root / "mute", *(episode(name, 9, with_action=False) for name in "bc"))
     with pytest.raises(NoWindowError, match="no window fits"):
         opened(root / "mute", acting=True)

@@ -25,9 +25,10 @@ def under(prefix: str, arrays: Arrays) -> Arrays:
 
 def load_arrays(module: nn.Module, arrays: Arrays) -> None:
     """Overwrite the module's tensors. RuntimeError where names or shapes are others."""
-    shapes = {name: tensor.shape for name, tensor in module.state_dict().items()}
-    # files hold no scalars, only vectors of one
-    tensors = {name: torch.from_numpy(array.reshape(shapes.get(name, array.shape))) for name, array in arrays.items()}
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    for name, tensor in module.state_dict().items():
+        if tensor.ndim == 0 and name in tensors:  # files hold no scalars, only vectors of one
+            tensors[name] = tensors[name].reshape(())
     module.load_state_dict(tensors)
 
 

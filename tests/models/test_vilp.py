@@ -21,7 +21,7 @@ from vilp_models.vqgan import VqganEncoder, build_vqgan
 
 PLANNER = {
     "width": 8, "multipliers": (1, 2), "blocks": 1, "groups": 8, "convolutions": "factorised", "vision_width": 4,
-    "denoising_steps": 2, "steps": 1, "batch_size": 1,
+    "denoising_steps": 2, "steps": 1, "warmup_steps": 0, "batch_size": 1,
 }  # fmt: skip
 N_ACTION_STEPS = 3  # a pair and a half
 
@@ -41,7 +41,12 @@ class CountingVqgan(VqganEncoder):
 
 
 def vilp(
-    n_action_steps: int = N_ACTION_STEPS, *, sees: str = "frames", condition: str = "token+concat", **options: Any
+    n_action_steps: int = N_ACTION_STEPS,
+    *,
+    sees: str = "frames",
+    condition: str = "token+concat",
+    low_dim: bool = False,
+    **options: Any,
 ) -> VilpPolicy:
     torch.manual_seed(0)
     recipe = PlannerRecipe(**PLANNER, condition=condition)  # type: ignore[arg-type]
@@ -50,7 +55,7 @@ def vilp(
         for parameter in planner.parameters():
             if not parameter.any():
                 nn.init.normal_(parameter, std=0.1)
-    policy = PolicyRecipe(vision_width=8, hidden=(32,), sees=sees, low_dim=True, batch_size=1)  # type: ignore[arg-type]
+    policy = PolicyRecipe(vision_width=8, hidden=(32,), sees=sees, low_dim=low_dim, batch_size=1)  # type: ignore[arg-type]
     low_level = LowLevelPolicy(policy, contract(), codebooks=codebooks())
     encoders = {view: CountingVqgan() for view in VIEWS}
     return VilpPolicy(planners, encoders, low_level, n_action_steps=n_action_steps, **options)
@@ -151,6 +156,12 @@ def test_timings_say_where_a_plan_went(condition: str) -> None:
     encoded = {"encode"} if condition == "token+concat" else set()
     assert set(policy.timings()) == {"condition", "denoise", "decode", "act"} | encoded
     assert min(policy.timings().values()) > 0
+
+
+def test_low_dim_that_nobody_knows_at_imagined_frames_is_refused() -> None:
+    assert vilp(STRIDE, low_dim=True).n_pairs == 1
+    with pytest.raises(UsageError, match=rf"low_dim = false(.|\n)*n_action_steps = {STRIDE}\)"):
+        vilp(STRIDE + 1, low_dim=True)
 
 
 def test_more_denoising_steps_than_noise_levels_are_refused() -> None:
