@@ -21,6 +21,9 @@ from vilp_data.types import F16, F32, I64, U8
 from vilp_models.checkpoint import model_tensors, read_recipe, read_state, run_for_view
 from vilp_models.recipe import Precision, VqganRecipe
 
+CPU_BATCH = 16
+"""Frames decoded at a time on a CPU: what 200 at once write no longer fits its caches, and takes four times as long."""
+
 LATENT_SCALING = 1.0
 """Latents are stored as the encoder gives them; whoever trains on them standardises with their statistics."""
 
@@ -165,8 +168,9 @@ class VqganEncoder:
         """`decode` on the encoder's device: latents of any float type to uint8 [B,H,W,3]. Under autocast codes are still chosen in
         float32, whose digits the distances need."""
         with torch.autocast(self.device.type, enabled=False):
-            z_q = self.model.quantize(z_BCHW.float())[0]
-        return to_frames(self.model.decode(z_q, force_not_quantize=True).sample)
+            z_q: Tensor = self.model.quantize(z_BCHW.float())[0]
+        parts = z_q.split(CPU_BATCH) if self.device.type == "cpu" else (z_q,)
+        return torch.cat([to_frames(self.model.decode(part, force_not_quantize=True).sample) for part in parts])
 
 
 def encoder_digest(model: VQModel) -> str:

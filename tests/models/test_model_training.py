@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -198,10 +199,12 @@ def test_curves_of_a_resumed_run_have_every_step_once(tmp_path: Path, monkeypatc
     monkeypatch.setattr("vilp_models.training_loop.READ_EVERY", 1)
     trainee = plane_training()
     killed_at(9, trainee, lambda: fit_to(tmp_path, trainee, 12, checkpoint_every_s=0.0))
+    time.sleep(1.1)  # TensorBoard reads files in the order of the seconds in their names
     curves = Curves(tmp_path, first=9)  # went on, wrote two steps and a half, and was killed again
     curves.scalars(10, {"loss/fit": 7.0})
     curves.scalars(11, {"loss/fit": 7.0})
     curves.close()
+    time.sleep(1.1)
     fit_to(tmp_path, plane_training(), 12)
     assert _steps(tmp_path, "loss/fit") == list(range(1, 13))
 

@@ -41,11 +41,14 @@ width = 8
 groups = 8
 head_size = 8
 steps = 2
+warmup_steps = 0
 [models.policy]
 reconstructed_share = 0.5
 steps = 2
+warmup_steps = 0
 [models.bc]
 steps = 2
+warmup_steps = 0
 [models.vilp]
 n_action_steps = {N_ACTION_STEPS}
 """
