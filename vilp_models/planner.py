@@ -33,6 +33,9 @@ from vilp_models.vqgan import to_signed
 
 Sampler = Literal["ddim", "dpm++"]
 
+MOVING_STD = 0.5
+"""A latent pixel moves where some channel leaves the present by more than this share of its deviation over the training set."""
+
 
 @dataclass(frozen=True)
 class Condition:
@@ -103,7 +106,7 @@ class Planner(nn.Module):
     # --- training
 
     def losses(self, batch: WindowTensors, generator: torch.Generator) -> dict[str, Tensor]:
-        """{"denoising": mean squared error of what the network is to predict}, at a random level for each clip.
+        """{"denoising": (weighted) mean squared error of what the network is to predict}, at a random level for each clip.
 
         Frames past an episode's end count too: the goal absorbs. `generator` lives on the batch's device."""
         x0 = self._standardised(self.view, batch.latents[self.view]).transpose(1, 2)
@@ -113,7 +116,13 @@ class Planner(nn.Module):
         alpha_bar = self.alphas_bar[level].view(-1, 1, 1, 1, 1)
         predicted = self.predict(diffusion.add_noise(x0, noise, alpha_bar), level, condition)
         wanted = diffusion.target(x0, noise, alpha_bar, self.recipe.prediction)
-        return {"denoising": (predicted.float() - wanted).square().mean()}
+        error = (predicted.float() - wanted).square().mean(dim=1)
+        if not self.recipe.moving_weight:
+            return {"denoising": error.mean()}
+        present = self._standardised(self.view, batch.present_latents[self.view])[:, :, None]
+        moves = ((x0 - present).abs() > MOVING_STD).any(dim=1).any(dim=1, keepdim=True)
+        weight = (1.0 + self.recipe.moving_weight * moves).expand_as(error)
+        return {"denoising": (weight * error).sum() / weight.sum()}
 
     # --- imagining
 

@@ -200,6 +200,9 @@ class PlannerRecipe(TrainingRecipe):
     clip                frames in the network: "future" has the N planned ones t+Δt … t+NΔt alone (the paper's), "present" N+1, of
                         which the first is the frame at t, known (as the release's); planned are the same N
 
+    moving_weight       the loss weighs a latent pixel that leaves the present one anywhere in its clip 1 + this, then the weights are
+                        normalised; 0 is the paper's plain mean. What moves is otherwise a few pixels among many still ones
+
     Diffusion
     train_steps         levels of noise in training
     prediction          "v" with zero terminal SNR, or "epsilon"
@@ -218,6 +221,7 @@ class PlannerRecipe(TrainingRecipe):
     vision_width: int = Field(default=64, gt=0)
     low_dim: bool = True
     clip: Literal["future", "present"] = "future"
+    moving_weight: float = Field(default=0.0, ge=0)
 
     train_steps: int = Field(default=300, gt=1)
     prediction: Literal["v", "epsilon"] = "v"

@@ -169,7 +169,7 @@ class VqganEncoder:
         float32, whose digits the distances need."""
         with torch.autocast(self.device.type, enabled=False):
             z_q: Tensor = self.model.quantize(z_BCHW.float())[0]
-        parts = z_q.split(CPU_BATCH) if self.device.type == "cpu" else (z_q,)
+        parts = torch.split(z_q, CPU_BATCH) if self.device.type == "cpu" else (z_q,)
         return torch.cat([to_frames(self.model.decode(part, force_not_quantize=True).sample) for part in parts])
 
 
