@@ -80,8 +80,8 @@ def evaluate_planner(
         "samples": n_samples,
     }
     folder = run_dir / FOLDER
-    table = read_fresh_report(folder, inputs)
-    if table is None:
+
+    def make() -> None:
         report = planner_report.planner_report(
             store,
             sampling.of(trained, device),
@@ -94,9 +94,8 @@ def evaluate_planner(
             progress=progress,
         )
         write_planner_report(report, folder, inputs)
-        table = read_fresh_report(folder, inputs)
-        assert table is not None
-    return table, folder
+
+    return _made_once(folder, inputs, make), folder
 
 
 def evaluate_policy(
@@ -114,8 +113,8 @@ def evaluate_policy(
         **_judged_on(store, vqgan),
     }
     folder = run_dir / FOLDER
-    table = read_fresh_report(folder, inputs)
-    if table is None:
+
+    def make() -> None:
         pairs = PairDataset(
             root,
             split="val",
@@ -135,9 +134,18 @@ def evaluate_policy(
             progress=progress,
         )
         write_policy_report(report, folder, inputs)
+
+    return _made_once(folder, inputs, make), folder
+
+
+def _made_once(folder: Path, inputs: dict[str, Any], make: Callable[[], None]) -> dict[str, Any]:
+    """The report in `folder`, made now unless it is there with these inputs."""
+    table = read_fresh_report(folder, inputs)
+    if table is None:
+        make()
         table = read_fresh_report(folder, inputs)
         assert table is not None
-    return table, folder
+    return table
 
 
 def generate_videos(
