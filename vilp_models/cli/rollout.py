@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -19,6 +20,9 @@ from vilp_models.cli.options import (
     VqganOption,
     dataset_of,
 )
+
+if TYPE_CHECKING:
+    from vilp_models.starts import Recording, Start
 
 
 def rollout(
@@ -92,19 +96,13 @@ def rollout(
     from vilp_models.recipe import VilpRecipe, load_recipe
     from vilp_models.rollout_report import finished_rollout, format_rollout, read_rollout, roll_out_into
     from vilp_models.simulator import require_simulator
-    from vilp_models.starts import episode_starts, parse_seeds, seed_starts
     from vilp_models.trained import default_device
 
     if seeds is not None and (from_episodes is not None or episodes is not None):
         raise UsageError("episodes start at seeds or at recorded states, not both", remedy="leave one of them out")
     n_steps = max_steps or require_simulator(spec).max_steps
-    if seeds is None and (from_episodes is not None or policy in FOLLOWS_RECORDINGS):
-        side = from_episodes or "val"
-        starts, recordings = episode_starts(EpisodeStore(root), side, limit=episodes)
-        what = side if episodes is None else f"{side}-{len(starts)}"
-    else:
-        what = seeds or "0:50"
-        starts, recordings = seed_starts(parse_seeds(what)), {}
+    side = from_episodes or ("val" if seeds is None and policy in FOLLOWS_RECORDINGS else None)
+    starts, recordings, what = _starts(root, seeds or "0:50", side, episodes)
     settings = _settings(denoising_steps, sampler, precision)
     if settings and policy != "vilp":
         remedy = "leave --denoising-steps, --sampler and --precision out, or roll out vilp"
@@ -129,6 +127,18 @@ def rollout(
         )  # fmt: skip
     table = read_rollout(folder)
     print_json(table) if as_json else print("\n".join(format_rollout(table, folder)))
+
+
+def _starts(
+    root: Path, seeds: str, side: str | None, episodes: int | None
+) -> tuple[list[Start], Mapping[int, Recording], str]:
+    """The starts, the recordings that they have, and what to call them: episodes of a side of the split, else seeds."""
+    from vilp_models.starts import episode_starts, parse_seeds, seed_starts
+
+    if side is None:
+        return seed_starts(parse_seeds(seeds)), {}, seeds
+    starts, recordings = episode_starts(EpisodeStore(root), side, limit=episodes)
+    return starts, recordings, side if episodes is None else f"{side}-{len(starts)}"
 
 
 def _settings(denoising_steps: int | None, sampler: str | None, precision: str) -> list[str]:
