@@ -34,7 +34,7 @@ class ResNet18(nn.Module):
     def __init__(
         self, width: int, in_channels: int = 3, pool: Pool = "average", grid: bool = False, *, latents: bool = False
     ) -> None:
-        """`grid=True` leaves pooling out: `forward` is `tokens`."""
+        """`grid=True` leaves pooling out: `forward` gives the last map's cells row by row, [B,h*w,F] with F = `channels`."""
         super().__init__()
         self.channels = 8 * width
         self.stem = _latent_stem(in_channels, width) if latents else _image_stem(in_channels, width)
@@ -52,10 +52,6 @@ class ResNet18(nn.Module):
     def forward(self, x_BCHW: Tensor) -> Tensor:
         features: Tensor = self.pool(self.map(x_BCHW))
         return features
-
-    def tokens(self, x_BCHW: Tensor) -> Tensor:
-        """The last map as a sequence of cells, row by row: float [B,h*w,`channels`]. Pooling has no part in it."""
-        return _cells(self.map(x_BCHW))
 
     def map(self, x_BCHW: Tensor) -> Tensor:
         """The last map, float [B,`channels`,h,w]."""

@@ -25,7 +25,6 @@ def test_the_last_map_is_coarse_for_averages_and_fine_for_keypoints(
     images = torch.randn(2, *shape)
     assert network.map(images).shape == (2, 64, *cells)
     assert network(images).shape == (2, network.features)
-    assert network.tokens(images).shape == (2, cells[0] * cells[1], 64)
 
 
 def test_a_grid_is_the_cells_of_the_last_map_row_by_row() -> None:
@@ -33,7 +32,7 @@ def test_a_grid_is_the_cells_of_the_last_map_row_by_row() -> None:
     images = torch.randn(1, 3, 64, 96)
     grid = network(images)
     assert grid.shape == (1, 6, network.features)
-    assert torch.equal(grid, network.tokens(images))
+    assert torch.equal(grid, network.map(images).flatten(2).transpose(1, 2))
     assert torch.equal(grid[0, 4], network.map(images)[0, :, 1, 1])
 
 
