@@ -43,7 +43,8 @@ class Condition:
 
     projected  what the UNet's attention keeps of the context
     beside     present latents of all views for concatenation, standardised, [B,C',1,h,w]; None without
-    present    this view's present latents, standardised, [B,C,1,h,w]: the clip's known first frame; None where clips begin after it
+    present    this view's present latents, standardised, [B,C,1,h,w]: the clip's known first frame, or what change is measured from;
+               None where neither is asked for
     """
 
     projected: list[Projected]
@@ -90,7 +91,7 @@ class Planner(nn.Module):
     @property
     def sees_latents(self) -> bool:
         """Whether `condition` needs the present frames' latents."""
-        return self.concatenates or self.recipe.clip == "present"
+        return self.concatenates or self.recipe.clip == "present" or self.recipe.diffuses == "change"
 
     def denoising_steps(self, asked: int | None = None) -> int:
         """As many as asked for, else the recipe's. Raises UsageError for more than there are noise levels to visit."""
@@ -111,6 +112,9 @@ class Planner(nn.Module):
         Frames past an episode's end count too: the goal absorbs. `generator` lives on the batch's device."""
         x0 = self._standardised(self.view, batch.latents[self.view]).transpose(1, 2)
         condition = self.condition(batch.frames, batch.present_latents, batch.low_dim)
+        if self.recipe.diffuses == "change":
+            assert condition.present is not None
+            x0 = x0 - condition.present
         level = torch.randint(len(self.alphas_bar), (len(x0),), generator=generator, device=x0.device)
         noise = torch.randn(x0.shape, generator=generator, device=x0.device)
         alpha_bar = self.alphas_bar[level].view(-1, 1, 1, 1, 1)
@@ -119,8 +123,10 @@ class Planner(nn.Module):
         error = (predicted.float() - wanted).square().mean(dim=1)
         if not self.recipe.moving_weight:
             return {"denoising": error.mean()}
-        present = self._standardised(self.view, batch.present_latents[self.view])[:, :, None]
-        moves = ((x0 - present).abs() > MOVING_STD).any(dim=1).any(dim=1, keepdim=True)
+        change = x0
+        if self.recipe.diffuses == "latents":
+            change = x0 - self._standardised(self.view, batch.present_latents[self.view])[:, :, None]
+        moves = (change.abs() > MOVING_STD).any(dim=1).any(dim=1, keepdim=True)
         weight = (1.0 + self.recipe.moving_weight * moves).expand_as(error)
         return {"denoising": (weight * error).sum() / weight.sum()}
 
@@ -138,14 +144,16 @@ class Planner(nn.Module):
         if self.concatenates:
             parts = [self._standardised(v, present_latents[v]) for v in self.views]
             beside = torch.cat(parts, dim=1).unsqueeze(2)
-        if self.recipe.clip == "present":
+        if self.recipe.clip == "present" or self.recipe.diffuses == "change":
             present = self._standardised(self.view, present_latents[self.view]).unsqueeze(2)
         return Condition(projected, beside, present)
 
     def predict(self, x_BCThw: Tensor, level_B: Tensor, condition: Condition) -> Tensor:
         """One call of the UNet on standardised noisy latents of the planned frames; returns the same shape."""
-        known = 0 if condition.present is None else 1
-        x = x_BCThw if condition.present is None else torch.cat([condition.present, x_BCThw], dim=2)
+        x, known = x_BCThw, 0
+        if self.recipe.clip == "present":
+            assert condition.present is not None
+            x, known = torch.cat([condition.present, x], dim=2), 1
         if condition.beside is not None:
             x = torch.cat([x, condition.beside.expand(-1, -1, x.shape[2], -1, -1)], dim=1)
         out: Tensor = self.unet(x, level_B, condition.projected)
@@ -169,6 +177,9 @@ class Planner(nn.Module):
         else:
             spacing = recipe.spacing
             x0 = diffusion.dpm_solver(network, start, self._schedule, n_steps, spacing=spacing, prediction=prediction)
+        if recipe.diffuses == "change":
+            assert condition.present is not None
+            x0 = x0 + condition.present
         return self._normaliser(self.view).restored(x0.transpose(1, 2).float())
 
     def _normaliser(self, view: str) -> Normaliser:

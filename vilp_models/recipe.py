@@ -55,6 +55,7 @@ class VqganRecipe(Frozen):
     perceptual: Literal["none", "alex", "vgg"] = "vgg"
     perceptual_weight: float = Field(default=1.0, ge=0)
     perceptual_images: int | None = Field(default=None, gt=0)
+    diffuses: Literal["latents", "change"] = "latents"
     moving_weight: float = Field(default=0.0, ge=0)
     codebook_weight: float = Field(default=1.0, ge=0)
     commitment: float = Field(default=0.25, ge=0)
@@ -200,6 +201,9 @@ class PlannerRecipe(TrainingRecipe):
     clip                frames in the network: "future" has the N planned ones t+Δt … t+NΔt alone (the paper's), "present" N+1, of
                         which the first is the frame at t, known (as the release's); planned are the same N
 
+    diffuses            "latents" of the planned frames (the paper's), or their "change" since the present frame's, which is zero
+                        wherever nothing moves: what stands still need not be drawn again
+
     moving_weight       the loss weighs a latent pixel that leaves the present one anywhere in its clip 1 + this, then the weights are
                         normalised; 0 is the paper's plain mean. What moves is otherwise a few pixels among many still ones
 
@@ -221,6 +225,7 @@ class PlannerRecipe(TrainingRecipe):
     vision_width: int = Field(default=64, gt=0)
     low_dim: bool = True
     clip: Literal["future", "present"] = "future"
+    diffuses: Literal["latents", "change"] = "latents"
     moving_weight: float = Field(default=0.0, ge=0)
 
     train_steps: int = Field(default=300, gt=1)
@@ -252,6 +257,10 @@ class PlannerRecipe(TrainingRecipe):
             )
         if self.denoising_steps > self.train_steps:
             raise ValueError(f"denoising_steps = {self.denoising_steps} is more than train_steps = {self.train_steps}")
+        if self.clip == "present" and self.diffuses == "change":
+            raise ValueError(
+                'the change since the present is nothing at the present itself: clip = "future" where diffuses = "change"'
+            )
         if self.condition == "concat" and self.low_dim:
             raise ValueError('condition = "concat" has no place for low_dim: low_dim = false, or "token+concat"')
         return self

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vilp_data.cli import JsonOption, PresetOption, print_json, progress_bar
+from vilp_data.cli.options import JsonOption, PresetOption, print_json, progress_bar
 from vilp_data.episodes import EpisodeStore
 from vilp_models.cli.options import (
     DataOption,

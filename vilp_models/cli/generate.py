@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vilp_data.cli import PresetOption, progress_bar
+from vilp_data.cli.options import PresetOption, progress_bar
 from vilp_models.cli.options import (
     DataOption,
     DenoisingStepsOption,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vilp_data.cli import JsonOption, PresetOption, print_json, progress_bar
+from vilp_data.cli.options import JsonOption, PresetOption, print_json, progress_bar
 from vilp_data.episodes import EpisodeStore
 from vilp_data.spec import TaskSpec
 from vilp_models.cli.options import (

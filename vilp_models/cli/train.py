@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from vilp_data.cli import PresetOption
+from vilp_data.cli.options import PresetOption
 from vilp_data.episodes import EpisodeStore
 from vilp_models.cli.options import DataOption, RestartOption, RunOption, TaskOption, VqganOption, dataset_of
 from vilp_models.runs import default_run, find_model_run

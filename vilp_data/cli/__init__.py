@@ -1,0 +1,51 @@
+"""`vilp-data`: one verb for each thing it makes. Thin: its files parse, call, print."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from vilp_data.cli import datasets, logs, view
+from vilp_data.errors import VilpDataError
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Episode logs in, latent shards out.",
+)
+# The order of --help: the walk of an episode.
+for verb in (
+    logs.record,
+    logs.inspect,
+    logs.ingest,
+    datasets.split,
+    datasets.latents,
+    datasets.why_stale,
+    view.view,
+):
+    app.command(verb.__name__.replace("_", "-"))(verb)
+
+
+def main() -> None:
+    """Run the command line `vilp-data`."""
+    run_app(app, "vilp-data")
+
+
+def run_app(commands: typer.Typer, name: str) -> None:
+    """Run a command line whose errors end in words, not in a traceback.
+
+    Exit codes: 0 done, 1 findings or partial loss, 2 wrong use, 130 stopped by Ctrl-C."""
+    try:
+        commands()
+    except VilpDataError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            print(f"{name}: stopped; what was finished is kept, run the same command again to go on", file=sys.stderr)
+        raise

@@ -1,0 +1,131 @@
+"""Verbs about datasets: split, latents, why-stale."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vilp_data.cli.options import (
+    DatasetArgument,
+    JsonOption,
+    PresetOption,
+    WorkersOption,
+    latent_bar,
+    open_dataset,
+    print_json,
+)
+from vilp_data.engine import cpu_count
+from vilp_data.spec import load_task
+
+
+def split(
+    dataset: DatasetArgument = None,
+    ratio: Annotated[
+        float | None, typer.Option(help="Share of training episodes. Default: the task's (0.9).", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the draw. Default: the task's.", show_default=False)] = None,
+    redraw: Annotated[bool, typer.Option(help="Forget the present assignment and draw anew.")] = False,
+    check: Annotated[bool, typer.Option(help="Change nothing; say what is wrong with the split.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Assign every episode to training or validation, for good: later runs place only what is new.
+
+    Example: vilp-data split --ratio 0.9
+    """
+    from vilp_data.dataset_split import check_dataset_split, find_split, lock_path, update_split
+
+    root, spec = open_dataset(dataset)
+    if check:
+        findings = check_dataset_split(root)
+        print_json(findings) if as_json else print("\n".join(findings) or f"{lock_path(root)}: nothing wrong")
+        raise typer.Exit(1 if findings else 0)
+    kept = find_split(root) is not None and not redraw
+    lock = update_split(
+        root,
+        ratio=spec.split.ratio if ratio is None else ratio,
+        ratio_from="task" if ratio is None else "command line",
+        seed=spec.split.seed if seed is None else seed,
+        group_by=spec.split.group_by,
+        strata=spec.split.strata,
+        redraw=redraw,
+    )
+    if as_json:
+        print(lock.to_json().decode())
+        return
+    train, val = lock.ids("train"), lock.ids("val")
+    drawn = f"ratio {lock.ratio:g} from the {lock.ratio_from}, seed {lock.seed}"
+    print(f"{lock_path(root)}: {len(train)} training, {len(val)} validation episodes ({drawn})")
+    if kept:
+        print("  episodes placed before stay where they are; --redraw draws anew")
+    for group in lock.duplicates:
+        print(f"  identical, kept on one side: {', '.join(group)}")
+    crossing = [pair for pair in lock.near_duplicates if lock.assignment[pair.first] != lock.assignment[pair.second]]
+    if crossing:
+        closest = f"{crossing[0].first} and {crossing[0].second}"
+        print(f"  {len(crossing)} pairs across the sides look nearly alike, closest {closest}; see the lock")
+
+
+def latents(
+    dataset: DatasetArgument = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the trained frame encoder. Default: the only one under DATASET/runs.", show_default=False
+        ),
+    ] = None,
+    encoder: Annotated[
+        str, typer.Option(help="Kind of frame encoder, as registered under vilp.frame_encoders.")
+    ] = "vqgan",
+    workers: WorkersOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Encode every stored frame once, with a trained frame encoder.
+
+    Example: vilp-data latents data/hanoi --run data/hanoi/runs/vqgan-cpu
+    """
+    from vilp_data.latent_runs import encode_dataset, find_run
+
+    root, spec = open_dataset(dataset)
+    folder = find_run(root, run, encoder)
+    with latent_bar() as progress:
+        done = encode_dataset(root, spec, encoder, folder, workers=workers or cpu_count(), progress=progress)
+    if as_json:
+        print_json(dataclasses.asdict(done))
+        return
+    for view, key in done.keys.items():
+        print(
+            f"{root}/latents/{view}/{key}: {done.shards[view]} shards"
+            + ("" if done.written[view] else ", all there already")
+        )
+    if done.frames:
+        bare = f"{done.ratio:.0%} of the bare forward loop ({done.bare_frames_per_s:.0f} frames/s)"
+        print(f"{done.frames} frames encoded at {done.frames_per_s:.0f} frames/s, {bare}")
+    if done.unseen:
+        print(f"  {len(done.unseen)} training episodes are new to the encoder: {', '.join(done.unseen[:5])}")
+
+
+def why_stale(
+    dataset: DatasetArgument = None,
+    task: Annotated[
+        str | None, typer.Option(help="Compare with this task's spec instead of the dataset's own.", show_default=False)
+    ] = None,
+    preset: PresetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Name the field that makes stored episodes or latents stale.
+
+    Example: vilp-data why-stale data/hanoi --task hanoi
+    """
+    from vilp_data.staleness import stale_episodes, stale_latents
+
+    root, spec = open_dataset(dataset)
+    spec = load_task(task, preset=preset) if task else spec
+    reasons = stale_episodes(root, spec) | stale_latents(root, spec)
+    if as_json:
+        print_json(reasons)
+    else:
+        print("\n".join(f"{what}: {why}" for what, why in sorted(reasons.items())) or f"{root}: nothing is stale")
+    raise typer.Exit(1 if reasons else 0)
