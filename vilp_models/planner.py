@@ -33,9 +33,6 @@ from vilp_models.vqgan import to_signed
 
 Sampler = Literal["ddim", "dpm++"]
 
-MOVING_STD = 0.5
-"""A latent pixel moves where some channel leaves the present by more than this share of its deviation over the training set."""
-
 
 @dataclass(frozen=True)
 class Condition:
@@ -43,8 +40,7 @@ class Condition:
 
     projected  what the UNet's attention keeps of the context
     beside     present latents of all views for concatenation, standardised, [B,C',1,h,w]; None without
-    present    this view's present latents, standardised, [B,C,1,h,w]: the clip's known first frame, or what change is measured from;
-               None where neither is asked for
+    present    this view's present latents, standardised, [B,C,1,h,w]: the clip's known first frame; None where clips begin after it
     """
 
     projected: list[Projected]
@@ -91,7 +87,7 @@ class Planner(nn.Module):
     @property
     def sees_latents(self) -> bool:
         """Whether `condition` needs the present frames' latents."""
-        return self.concatenates or self.recipe.clip == "present" or self.recipe.diffuses == "change"
+        return self.concatenates or self.recipe.clip == "present"
 
     def denoising_steps(self, asked: int | None = None) -> int:
         """As many as asked for, else the recipe's. Raises UsageError for more than there are noise levels to visit."""
@@ -107,28 +103,17 @@ class Planner(nn.Module):
     # --- training
 
     def losses(self, batch: WindowTensors, generator: torch.Generator) -> dict[str, Tensor]:
-        """{"denoising": (weighted) mean squared error of what the network is to predict}, at a random level for each clip.
+        """{"denoising": mean squared error of what the network is to predict}, at a random level for each clip.
 
         Frames past an episode's end count too: the goal absorbs. `generator` lives on the batch's device."""
         x0 = self._standardised(self.view, batch.latents[self.view]).transpose(1, 2)
         condition = self.condition(batch.frames, batch.present_latents, batch.low_dim)
-        if self.recipe.diffuses == "change":
-            assert condition.present is not None
-            x0 = x0 - condition.present
         level = torch.randint(len(self.alphas_bar), (len(x0),), generator=generator, device=x0.device)
         noise = torch.randn(x0.shape, generator=generator, device=x0.device)
         alpha_bar = self.alphas_bar[level].view(-1, 1, 1, 1, 1)
         predicted = self.predict(diffusion.add_noise(x0, noise, alpha_bar), level, condition)
         wanted = diffusion.target(x0, noise, alpha_bar, self.recipe.prediction)
-        error = (predicted.float() - wanted).square().mean(dim=1)
-        if not self.recipe.moving_weight:
-            return {"denoising": error.mean()}
-        change = x0
-        if self.recipe.diffuses == "latents":
-            change = x0 - self._standardised(self.view, batch.present_latents[self.view])[:, :, None]
-        moves = (change.abs() > MOVING_STD).any(dim=1).any(dim=1, keepdim=True)
-        weight = (1.0 + self.recipe.moving_weight * moves).expand_as(error)
-        return {"denoising": (weight * error).sum() / weight.sum()}
+        return {"denoising": (predicted.float() - wanted).square().mean()}
 
     # --- imagining
 
@@ -144,7 +129,7 @@ class Planner(nn.Module):
         if self.concatenates:
             parts = [self._standardised(v, present_latents[v]) for v in self.views]
             beside = torch.cat(parts, dim=1).unsqueeze(2)
-        if self.recipe.clip == "present" or self.recipe.diffuses == "change":
+        if self.recipe.clip == "present":
             present = self._standardised(self.view, present_latents[self.view]).unsqueeze(2)
         return Condition(projected, beside, present)
 
@@ -177,9 +162,6 @@ class Planner(nn.Module):
         else:
             spacing = recipe.spacing
             x0 = diffusion.dpm_solver(network, start, self._schedule, n_steps, spacing=spacing, prediction=prediction)
-        if recipe.diffuses == "change":
-            assert condition.present is not None
-            x0 = x0 + condition.present
         return self._normaliser(self.view).restored(x0.transpose(1, 2).float())
 
     def _normaliser(self, view: str) -> Normaliser:

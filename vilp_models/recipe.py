@@ -55,7 +55,6 @@ class VqganRecipe(Frozen):
     perceptual: Literal["none", "alex", "vgg"] = "vgg"
     perceptual_weight: float = Field(default=1.0, ge=0)
     perceptual_images: int | None = Field(default=None, gt=0)
-    diffuses: Literal["latents", "change"] = "latents"
     moving_weight: float = Field(default=0.0, ge=0)
     codebook_weight: float = Field(default=1.0, ge=0)
     commitment: float = Field(default=0.25, ge=0)
@@ -201,14 +200,9 @@ class PlannerRecipe(TrainingRecipe):
     clip                frames in the network: "future" has the N planned ones t+Δt … t+NΔt alone (the paper's), "present" N+1, of
                         which the first is the frame at t, known (as the release's); planned are the same N
 
-    diffuses            "latents" of the planned frames (the paper's), or their "change" since the present frame's, which is zero
-                        wherever nothing moves: what stands still need not be drawn again
-
-    moving_weight       the loss weighs a latent pixel that leaves the present one anywhere in its clip 1 + this, then the weights are
-                        normalised; 0 is the paper's plain mean. What moves is otherwise a few pixels among many still ones
-
     Diffusion
-    train_steps         levels of noise in training
+    train_steps         levels of noise in training, and the most denoising steps that can be asked for. Few levels learn faster:
+                        those that the sampler does not visit teach it nothing
     prediction          "v" with zero terminal SNR, or "epsilon"
     spacing             of the sampler's steps: "trailing" begins at pure noise, "leading" as the release does. epsilon needs "leading"
     sampler, denoising_steps
@@ -225,8 +219,6 @@ class PlannerRecipe(TrainingRecipe):
     vision_width: int = Field(default=64, gt=0)
     low_dim: bool = True
     clip: Literal["future", "present"] = "future"
-    diffuses: Literal["latents", "change"] = "latents"
-    moving_weight: float = Field(default=0.0, ge=0)
 
     train_steps: int = Field(default=300, gt=1)
     prediction: Literal["v", "epsilon"] = "v"
@@ -257,10 +249,6 @@ class PlannerRecipe(TrainingRecipe):
             )
         if self.denoising_steps > self.train_steps:
             raise ValueError(f"denoising_steps = {self.denoising_steps} is more than train_steps = {self.train_steps}")
-        if self.clip == "present" and self.diffuses == "change":
-            raise ValueError(
-                'the change since the present is nothing at the present itself: clip = "future" where diffuses = "change"'
-            )
         if self.condition == "concat" and self.low_dim:
             raise ValueError('condition = "concat" has no place for low_dim: low_dim = false, or "token+concat"')
         return self
@@ -334,7 +322,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         },
         "cpu": {
             **_ADAM_SMALL, "width": 32, "blocks": 1, "groups": 16, "head_size": 32, "condition": "concat", "low_dim": False,
-            "steps": 8000, "batch_size": 32, "warmup_steps": 100, "precision": "bf16",
+            "train_steps": 4, "steps": 12_000, "batch_size": 32, "warmup_steps": 100, "precision": "bf16",
         },
         "paper": {},
     },

@@ -215,19 +215,3 @@ def test_views_of_different_sizes_cannot_be_concatenated():
     odd = dataclasses.replace(contract(), latent_shapes={"side": (3, 4, 4), "top": (3, 4, 6)})
     with pytest.raises(UsageError, match="cannot be concatenated"):
         Planner(PlannerRecipe.model_validate({**SMALL, "condition": "token+concat"}), odd, "top")
-
-
-def test_moving_weight_counts_what_leaves_the_present_more():
-    data = batch()
-    still = data.present_latents["top"][:, None].expand(-1, 5, -1, -1, -1).clone()
-    still[:, 3:, :, 1, 2] += 3  # one latent pixel moves, from the fourth frame on
-    data = dataclasses.replace(data, latents={**data.latents, "top": still})
-
-    def loss(**changes):
-        return planner(condition="concat", **changes).losses(data, torch.Generator().manual_seed(0))["denoising"]
-
-    plain, weighted, almost_alone = loss(), loss(moving_weight=4.0), loss(moving_weight=1e6)
-    of_moving = (almost_alone - plain).item()
-    assert abs(of_moving) > 1e-3
-    share = 5 / (5 + 23)  # of the weights: one pixel of 24 counts five times
-    assert weighted.item() == pytest.approx(plain.item() + of_moving * (share - 1 / 24) / (1 - 1 / 24), rel=1e-3)
