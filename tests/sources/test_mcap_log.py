@@ -18,7 +18,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from tests.real_data import real_data
 from tests.synthetic import ACTION_TOPIC, HEADER_LAG_NS, JOINT_TOPIC, START_NS, STORE, Encoding, image_topic, write_mcap
-from vilp_data.decode import decode_vector
+from tests.synthetic_bags import ROS1_STORE
+from vilp_data.decode import decode_vector, header_time_ns
 from vilp_data.errors import LogError
 from vilp_data.sources import MessageError, open_log
 from vilp_data.types import Message
@@ -191,7 +192,7 @@ def test_a_flipped_byte_in_a_chunk_names_the_file_and_the_way_out(tmp_path: Path
     where = content.index(b"shoulder", len(content) // 3)
     (path,) = damaged_copies(tmp_path / "flipped.mcap", content, [(where, 4)])
     with pytest.raises(
-        LogError, match=r"flipped\.mcap: the log is damaged at the chunk at byte .*\n.*CRC(.|\n)*mcap recover"
+        LogError, match=r"flipped\.mcap: the log is damaged at the chunk at byte .*\n.*CRC(.|\n)*vilp-data salvage"
     ):
         read(path)
 
@@ -332,10 +333,14 @@ def test_bytes_that_do_not_fit_their_schema_name_topic_and_time(tmp_path: Path) 
 
 
 def write_cdr(path: Path, schema: tuple[str, str, bytes], data: bytes) -> Path:
+    return write_messages(path, "cdr", schema, data)
+
+
+def write_messages(path: Path, encoding: str, schema: tuple[str, str, bytes], data: bytes) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream)
-        writer.start("ros2", "test")
-        writer.add_message(writer.register_channel("/t", "cdr", writer.register_schema(*schema)), 1, data, 1)
+        writer.start("", "test")
+        writer.add_message(writer.register_channel("/t", encoding, writer.register_schema(*schema)), 1, data, 1)
         writer.finish()
     return path
 
@@ -358,6 +363,48 @@ POINT_CDR = bytes(STORE.serialize_cdr(STORE.types["geometry_msgs/msg/Point"](1.0
 def test_every_way_to_describe_a_ros_type_is_understood(tmp_path: Path, schema: tuple[str, str, bytes]) -> None:
     (message,) = read(write_cdr(tmp_path / "run.mcap", schema, POINT_CDR))
     assert decode_vector(message, ["x", "y", "z"]).tolist() == [1, 2, 3]
+
+
+def test_ros1_messages_are_read_by_their_ros1_schema_and_named_as_in_ros2(tmp_path: Path) -> None:
+    types = ROS1_STORE.types
+    header = types["std_msgs/msg/Header"](7, types["builtin_interfaces/msg/Time"](12, 34), "base")
+    vector = types["geometry_msgs/msg/Vector3"](1.0, 2.0, 3.0)
+    body = types["geometry_msgs/msg/Vector3Stamped"](header, vector)
+    definition = ROS1_STORE.generate_msgdef(body.__msgtype__)[0].encode()
+    data = bytes(ROS1_STORE.serialize_ros1(body, body.__msgtype__))
+    schema = ("geometry_msgs/Vector3Stamped", "ros1msg", definition)
+    (message,) = read(write_messages(tmp_path / "run.mcap", "ros1", schema, data))
+    assert message.schema == "geometry_msgs/msg/Vector3Stamped"
+    assert decode_vector(message, ["vector"]).tolist() == [1, 2, 3]
+    assert header_time_ns(message) == 12_000_000_034
+
+
+@pytest.mark.parametrize("encoding", ["flatbuffer", "cbor", "msgpack", ""])
+def test_a_topic_in_an_encoding_that_is_not_read_is_listed_and_keeps_no_other_back(
+    tmp_path: Path, encoding: str
+) -> None:
+    path = write_json(tmp_path / "run.mcap", [1, 2], before=lambda w: other_message(w, encoding))
+    assert [m.topic for m in read(path, ["/t"])] == ["/t", "/t"]
+    with open_log(path) as log:
+        assert [(t.name, t.message_count) for t in log.topics()] == [("/other", 1), ("/t", 2)]
+        with pytest.raises(LogError, match=f"/other: (.|\n)*encoding that is not read(.|\n)*{encoding}"):
+            log.messages(["/other"])
+
+
+def other_message(writer: Writer, encoding: str) -> None:
+    schema = writer.register_schema("foxglove.Pose", encoding, b"\x01")
+    writer.add_message(writer.register_channel("/other", encoding, schema), 5, b"\x02", 5)
+
+
+def test_json_of_any_depth_is_a_message_or_an_error(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [1], before=lambda w: deep_message(w, 100_000))
+    assert len(read(path, ["/t"])) == 1
+    with pytest.raises(MessageError, match="/deep"):
+        read(path, ["/deep"])
+
+
+def deep_message(writer: Writer, depth: int) -> None:
+    writer.add_message(writer.register_channel("/deep", "json", 0), 5, b"[" * depth + b"]" * depth, 5)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,18 @@ from pathlib import Path
 from typing import Protocol
 
 from vilp_data.errors import LogError, UsageError
+from vilp_data.sources.db3_log import MAGIC as SQLITE_MAGIC
+from vilp_data.sources.db3_log import Db3Log
+from vilp_data.sources.hdf5_log import Hdf5Log
+from vilp_data.sources.hdf5_tree import MAGIC as HDF5_MAGIC
+from vilp_data.sources.lerobot_log import LeRobotLog
+from vilp_data.sources.lerobot_meta import is_lerobot
 from vilp_data.sources.mcap_log import McapLog
 from vilp_data.sources.mcap_records import MAGIC as MCAP_MAGIC
-from vilp_data.sources.message_decoders import MessageError
+from vilp_data.sources.message_decoders import ZSTD_MAGIC, MessageError
+from vilp_data.sources.rosbag1_log import Rosbag1Log
+from vilp_data.sources.rosbag2_log import Rosbag2Log
+from vilp_data.sources.rosbag2_metadata import is_bag_folder, lone_file
 from vilp_data.sources.zarr_log import ZarrLog
 from vilp_data.types import I64, LogReader, Message
 
@@ -44,22 +53,28 @@ class LogFormat:
 FORMATS = (
     LogFormat("MCAP", lambda path, head: head.startswith(MCAP_MAGIC), lambda path, rate_hz: McapLog(path)),
     LogFormat("zarr", lambda path, head: _is_zarr(path), lambda path, rate_hz: ZarrLog(path, array_rate_hz=rate_hz)),
-    LogFormat("ROS 1 bag", lambda path, head: head.startswith(b"#ROSBAG V"), None),
-    LogFormat("SQLite (ROS 2 db3)", lambda path, head: head.startswith(b"SQLite format 3\0"), None),
-    LogFormat("HDF5", lambda path, head: head.startswith(b"\x89HDF\r\n\x1a\n"), None),
+    LogFormat("LeRobot", lambda path, head: is_lerobot(path), lambda path, rate_hz: LeRobotLog(path)),
+    LogFormat("ROS 1 bag", lambda path, head: head.startswith(b"#ROSBAG V"), lambda path, rate_hz: Rosbag1Log(path)),
+    LogFormat("ROS 2 bag", lambda path, head: _is_rosbag2(path, head), lambda path, rate_hz: Rosbag2Log(path)),
+    LogFormat("ROS 2 db3", lambda path, head: head.startswith(SQLITE_MAGIC), lambda path, rate_hz: Db3Log(path)),
+    LogFormat(
+        "HDF5",
+        lambda path, head: head.startswith(HDF5_MAGIC),
+        lambda path, rate_hz: Hdf5Log(path, array_rate_hz=rate_hz),
+    ),
 )
 
 
 def open_log(path: Path, *, array_rate_hz: float = 10.0) -> IndexedLog:
     """A reader for the log at `path`, its format told by content, not by suffix. Use it as a context manager.
 
-    A rosbag2 folder (metadata.yaml beside one .mcap file) stands for the file in it. Split bags are not joined: a LogError.
+    The folder of a ROS 2 bag (metadata.yaml beside its files) is one log; one of a single plain file stands for that file.
     `array_rate_hz` is the rate of rows in logs that carry no time (zarr). UsageError where nothing is there; LogError where it
     is empty, not a log, a log of a format that is not read, or cut off."""
     if not path.exists():
         raise UsageError("no such log", where=path, remedy="check the path")
-    if path.is_dir():
-        path = _file_of_bag(path) or path
+    if is_bag_folder(path):
+        path = lone_file(path) or path
     head = _head(path)
     for log_format in FORMATS:
         if log_format.matches(path, head):
@@ -71,16 +86,9 @@ def open_log(path: Path, *, array_rate_hz: float = 10.0) -> IndexedLog:
     raise _not_a_log(path, head)
 
 
-def _file_of_bag(folder: Path) -> Path | None:
-    """The one MCAP file of a rosbag2 folder, None where the folder is none; LogError where it holds several."""
-    if not (folder / "metadata.yaml").is_file():
-        return None
-    files = sorted(folder.glob("*.mcap"))
-    if len(files) > 1:
-        names = ", ".join(file.name for file in files)
-        remedy = "split bags are not joined yet: name one file, or join them with `mcap merge`"
-        raise LogError("the bag is split into several files", where=folder, found=names, remedy=remedy)
-    return files[0] if files else None
+def _is_rosbag2(path: Path, head: bytes) -> bool:
+    """A bag's folder, or one compressed file of a bag."""
+    return is_bag_folder(path) or head.startswith(ZSTD_MAGIC)
 
 
 def _is_zarr(path: Path) -> bool:
@@ -104,7 +112,7 @@ def _not_a_log(path: Path, head: bytes) -> LogError:
         return LogError(
             "the folder is no log",
             where=path,
-            found=f"no .zgroup; inside: {inside}",
+            found=f"no metadata.yaml of a bag, no .zgroup; inside: {inside}",
             remedy=f"name the logs in it; {_readable()}",
         )
     if not head:

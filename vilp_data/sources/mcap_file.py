@@ -11,36 +11,28 @@ from collections.abc import Callable, Collection, Iterator
 from heapq import merge
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 
+from vilp_data.sources.channels import RawMessage
 from vilp_data.sources.mcap_index import read_index
 from vilp_data.sources.mcap_records import MESSAGE_HEAD, RECORD_HEAD, RecordReader
 from vilp_data.types import I64
-
-
-class RawMessage(NamedTuple):
-    """A message as the file holds it: times in nanoseconds, data still serialised."""
-
-    log_time_ns: int
-    publish_time_ns: int
-    channel_id: int
-    data: bytes
-
 
 _log_time = attrgetter("log_time_ns")
 
 
 class McapFile:
-    """An open MCAP file. LogError on opening where it is cut off or its index is damaged, on reading where a chunk is."""
+    """An open MCAP file. LogError on opening where it is cut off or its index is damaged, on reading where a chunk is.
 
-    def __init__(self, path: Path) -> None:
+    `named` is the path that errors name, where it is another than the file's."""
+
+    def __init__(self, path: Path, *, named: Path | None = None) -> None:
         self._stream = path.open("rb")
         try:
-            self._reader = RecordReader(path, self._stream, os.fstat(self._stream.fileno()).st_size)
+            self._reader = RecordReader(named or path, self._stream, os.fstat(self._stream.fileno()).st_size)
             self.index = read_index(self._reader)
         except BaseException:
             self._stream.close()

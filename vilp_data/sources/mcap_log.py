@@ -1,4 +1,4 @@
-"""MCAP logs: ROS 2 CDR, Foxglove protobuf and JSON messages. One file is one episode."""
+"""MCAP logs: ROS 1 and ROS 2 messages, Foxglove protobuf and JSON. One file is one episode."""
 
 from __future__ import annotations
 
@@ -7,40 +7,37 @@ from collections.abc import Collection, Iterator
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from mcap.records import ChunkIndex
 
-from vilp_data.errors import LogError, nearest
-from vilp_data.sources.mcap_file import McapFile, RawMessage
-from vilp_data.sources.message_decoders import MALFORMED, Decoder, MessageError, decoder_for
+from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage
+from vilp_data.sources.mcap_file import McapFile
 from vilp_data.types import EPISODE_RECORD, I64, LogEpisode, Message, TopicInfo
 
 END_OF_TIME_NS = 1 << 64  # past every MCAP time stamp
-WHOLE_FILE = "whole"  # the one demonstration's name: a renamed log must still be known as the same
 INDEXED_CHUNKS = 5000  # message indexes read by message_times: about 0.3 s
 
 
-class _OpenChannel(NamedTuple):
-    """A channel whose messages can be read."""
-
-    topic: str
-    schema: str
-    encoding: str
-    decode: Decoder
-
-
 class McapLog:
-    """A `LogReader` over one MCAP file. Opening reads the index only; LogError where the file is cut off or its index damaged."""
+    """A `LogReader` over one MCAP file. Opening reads the index only; LogError where the file is cut off or its index damaged.
+
+    `named` is the path that errors name, where the file is an inflated copy of another."""
 
     format = "mcap"
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file = McapFile(path)
-        self._channels: dict[int, _OpenChannel] = {}
-        self._decoders: dict[tuple[str, int], Decoder] = {}  # by message encoding and schema id
+    def __init__(self, path: Path, *, named: Path | None = None) -> None:
+        self.path = named or path
+        self._file = McapFile(path, named=self.path)
+        index = self._file.index
+        self._channels = Channels(
+            self.path,
+            {
+                channel_id: Channel(channel.topic, channel.message_encoding, index.schemas.get(channel.schema_id))
+                for channel_id, channel in index.channels.items()
+            },
+        )
         self._glanced: tuple[int, list[RawMessage]] | None = None  # place and messages of the chunk last glanced at
 
     def sha256(self) -> str:
@@ -49,17 +46,7 @@ class McapLog:
         return digest.hexdigest()
 
     def topics(self) -> list[TopicInfo]:
-        by_topic: dict[str, TopicInfo] = {}
-        index = self._file.index
-        for channel_id, channel in index.channels.items():
-            schema = index.schemas.get(channel.schema_id)
-            count = None if index.counts is None else index.counts[channel_id]
-            if (known := by_topic.get(channel.topic)) is not None and count is not None:
-                count += known.message_count or 0
-            by_topic[channel.topic] = TopicInfo(
-                channel.topic, schema.name if schema else "", channel.message_encoding, count
-            )
-        return sorted(by_topic.values(), key=lambda topic: topic.name)
+        return self._channels.topics(self._file.index.counts)
 
     def metadata(self) -> dict[str, dict[str, str]]:
         return self._file.metadata()
@@ -75,13 +62,20 @@ class McapLog:
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """As `LogReader.messages`. After a MessageError the iterator can be asked for the next message."""
-        channel_ids = self._channels_of(topics)
-        start = 0 if start_ns is None else start_ns
-        end = END_OF_TIME_NS if end_ns is None else end_ns
-        for channel_id in channel_ids:
-            self._opened(channel_id)  # an unreadable topic is refused before the first message of any
-        # `map` goes on after an error of `_decoded`, which a generator would not.
-        return map(self._decoded, self._file.messages(channel_ids, start, end))
+        # `map` goes on after an error of `decoded`, which a generator would not.
+        return map(self.decoded, self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
+
+    def raw_messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """The messages that `messages` gives, still serialised; an unreadable topic is refused before the first of any."""
+        channel_ids = self._channels.ids_of(topics)
+        self._channels.require_decoders(channel_ids)
+        return self._file.messages(channel_ids, start_ns or 0, END_OF_TIME_NS if end_ns is None else end_ns)
+
+    def decoded(self, raw: RawMessage) -> Message:
+        """The message of some bytes; MessageError where they do not fit its schema."""
+        return self._channels.decoded(raw)
 
     def message_times(self) -> tuple[dict[str, I64], bool]:
         """Topic -> log times [n] in file order, from the message indexes; and whether they are all (else the first part).
@@ -99,15 +93,15 @@ class McapLog:
 
     def first_messages(self, topic: str, limit: int) -> list[Message]:
         """Up to `limit` messages from the first chunk that holds the topic: a glance that opens one chunk."""
-        channel_ids = self._channels_of([topic])
+        channel_ids = self._channels.ids_of([topic])
         for chunk in self._file.index.chunks:
             if chunk.message_index_offsets and channel_ids.isdisjoint(chunk.message_index_offsets):
                 continue
             found = [raw for raw in self._glance_at(chunk) if raw.channel_id in channel_ids]
             if found:
-                return [self._decoded(raw) for raw in found[:limit]]
+                return [self.decoded(raw) for raw in found[:limit]]
         loose = self._file.messages(channel_ids, 0, END_OF_TIME_NS) if self._file.index.loose else iter(())
-        return [self._decoded(raw) for raw in islice(loose, limit)]
+        return [self.decoded(raw) for raw in islice(loose, limit)]
 
     def __enter__(self) -> Self:
         return self
@@ -117,45 +111,9 @@ class McapLog:
     ) -> None:
         self._file.close()
 
-    def _channels_of(self, topics: Collection[str]) -> set[int]:
-        channels = self._file.index.channels
-        known = {channel.topic for channel in channels.values()}
-        for topic in topics:
-            if topic not in known:
-                raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, known))
-        return {channel_id for channel_id, channel in channels.items() if channel.topic in topics}
-
     def _glance_at(self, chunk: ChunkIndex) -> list[RawMessage]:
         """Every message of a chunk; the latest chunk is kept, for most topics are glanced at in the same one."""
         if self._glanced is None or self._glanced[0] != chunk.chunk_start_offset:
             found = self._file.chunk_messages(chunk, self._file.index.channels, 0, END_OF_TIME_NS)
             self._glanced = chunk.chunk_start_offset, found
         return self._glanced[1]
-
-    def _opened(self, channel_id: int) -> _OpenChannel:
-        """The channel with its decoder; LogError where its messages cannot be read."""
-        if channel_id not in self._channels:
-            channel = self._file.index.channels[channel_id]
-            schema = self._file.index.schemas.get(channel.schema_id)
-            key = channel.message_encoding, channel.schema_id
-            if key not in self._decoders:
-                where = f"{self.path}, topic {channel.topic}"
-                self._decoders[key] = decoder_for(channel.message_encoding, schema, where=where)
-            name = schema.name if schema else ""
-            self._channels[channel_id] = _OpenChannel(
-                channel.topic, name, channel.message_encoding, self._decoders[key]
-            )
-        return self._channels[channel_id]
-
-    def _decoded(self, raw: RawMessage) -> Message:
-        channel = self._opened(raw.channel_id)
-        try:
-            body = channel.decode(raw.data)
-        except MALFORMED as error:
-            raise MessageError(
-                f"a message of {channel.topic} at {raw.log_time_ns} ns does not fit its schema",
-                where=f"{self.path}, topic {channel.topic}",
-                found=f"{channel.encoding} {channel.schema or '(no schema)'}, {len(raw.data)} bytes: {error}",
-                remedy="leave the topic out of the task, or record it with a matching schema",
-            ) from error
-        return Message(channel.topic, channel.schema, raw.log_time_ns, raw.publish_time_ns, body)

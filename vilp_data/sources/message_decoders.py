@@ -1,12 +1,14 @@
-"""Serialised messages of a log into Python objects: ROS 2 CDR, protobuf, JSON. The types come from the schemas in the log itself."""
+"""Serialised messages of a log into Python objects: ROS 1, ROS 2 (CDR), protobuf, JSON. Their types come from the log's own schemas.
+
+FlatBuffers, CBOR and MessagePack are not read: topics in them are listed, and refused only where they are asked for."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache, partial
 from typing import Any
 
+import zstandard
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 from mcap.exceptions import McapError
 from mcap.records import Schema
@@ -15,94 +17,152 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from vilp_data import limits
 from vilp_data.errors import LogError
+from vilp_data.sources.inflate import LARGEST_WINDOW
+from vilp_data.sources.json_messages import read_json
+from vilp_data.sources.ros_definitions import refuse_unreasonable
 
 Decoder = Callable[[bytes], Any]
 
 # What a decoder raises for bytes that do not fit their schema.
 MALFORMED = (
-    SerdeError,
-    TypesysError,
-    ProtobufDecodeError,
-    McapError,
-    ValueError,
-    KeyError,
-    TypeError,
-    IndexError,
-    AssertionError,
-)
+    SerdeError, TypesysError, ProtobufDecodeError, McapError, zstandard.ZstdError,
+    ValueError, KeyError, TypeError, IndexError, AssertionError, RecursionError, MemoryError, OverflowError,
+)  # fmt: skip
+
+ROS_ENCODINGS = ("ros1", "cdr")
+READABLE = "ROS 1 and ROS 2 (CDR) messages with ros1msg, ros2msg or ros2idl schemas, protobuf, JSON"
+UNDEFINED = "the log carries no definition of it, and it is no stock type of ROS"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+BEFORE_DEFINITIONS = "humble"
+"""The last ROS 2 whose recorders wrote no definitions into SQLite bags: what a bag without any is taken for."""
 
 
 class MessageError(LogError):
     """One message whose bytes do not fit their schema, in a log that is whole. `where` names the log and the topic."""
 
 
-READABLE = "CDR with ros2msg or ros2idl schemas, protobuf, JSON"
+def decoder_for(message_encoding: str, schema: Schema | None, *, where: str, distro: str = "") -> Decoder:
+    """A function from a message's bytes to an object with the schema's attributes (ROS, protobuf) or a dict (JSON).
 
-
-def decoder_for(message_encoding: str, schema: Schema | None, *, where: str) -> Decoder:
-    """A function from a message's bytes to an object with the schema's attributes (CDR, protobuf) or a dict (JSON).
-
-    LogError where the encoding is none of the three, or the schema cannot be understood; `where` names the topic in it."""
+    A ROS schema without text is looked up among the types that ship with ROS: 1, or 2 of the release `distro` (`humble`). LogError
+    where the encoding is none of READABLE, or the schema cannot be understood; `where` names the topic in it."""
     if message_encoding == "json":
-        return json.loads
+        return read_json
     try:
-        if message_encoding == "cdr" and schema is not None:
-            return _cdr_decoder(schema)
-        if message_encoding == "protobuf" and schema is not None:
-            decoder: Decoder | None = DecoderFactory().decoder_for(message_encoding, schema)
-            if decoder is not None:
-                return decoder
+        if schema is not None:
+            limits.check("the topic's schema", "DEFINITION_BYTES", len(schema.data), where=where)
+            if message_encoding in ROS_ENCODINGS:
+                return _ros_decoder(message_encoding, schema, distro)
+            if message_encoding == "protobuf":
+                decoder: Decoder | None = DecoderFactory().decoder_for(message_encoding, schema)
+                if decoder is not None:
+                    return decoder
     except MALFORMED as error:
-        reason = str(error).partition("\n")[0].rstrip(":") or repr(error)
-        found = f"{reason} (schema {schema.name!r}, {schema.encoding})" if schema else reason
+        found = _reason(error)
+        found += f" (schema {schema.name!r}, {schema.encoding or 'no definition'})" if schema else ""
         raise LogError(
             "the topic's schema cannot be understood", where=where, found=found, remedy=f"readable: {READABLE}"
         ) from error
-    found = (
-        f"messages in {message_encoding!r}, schema {schema.name!r} in {schema.encoding!r}"
-        if schema
-        else f"{message_encoding!r}, no schema"
-    )
+    found = f"messages in {message_encoding!r}"
+    found += f", schema {schema.name!r} in {schema.encoding!r}" if schema else ", no schema"
     raise LogError(
         "the topic's messages are in an encoding that is not read",
         where=where,
         found=found,
-        remedy=f"readable: {READABLE}",
+        remedy=f"leave the topic out of the task, or convert it; readable: {READABLE}",
     )
 
 
-def _cdr_decoder(schema: Schema) -> Decoder:
-    name = _full_name(schema.name)
-    text = schema.data.decode("utf-8")
-    if not text.strip() and name in _stock_types().fielddefs:
-        return _reader_of(_stock_types(), name)  # recorders that cannot find a definition leave its text empty
-    store = get_typestore(Stores.EMPTY)
-    if schema.encoding == "ros2msg":
-        store.register(get_types_from_msg(text, name))
-    elif schema.encoding in ("ros2idl", "omgidl"):
-        store.register(get_types_from_idl(text))
-    else:
-        raise ValueError("unknown schema encoding")
-    return _reader_of(store, name)
+def ros_name(name: str) -> str:
+    """`pkg/Type`, as ROS 1 and some recorders write it, is `pkg/msg/Type`: the one form that the rest of the pipeline sees."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
-def _reader_of(store: Typestore, name: str) -> Decoder:
+def _reason(error: BaseException) -> str:
+    if isinstance(error, RecursionError):
+        return "types that contain themselves, or nest too deep"
+    if isinstance(error, KeyError):
+        return f"it refers to {error.args[0] if error.args else '?'}, which it does not define"
+    return str(error).partition("\n")[0].rstrip(":") or repr(error)
+
+
+# --- ROS ------------------------------------------------------------------------------------------------------------
+
+
+def _ros_decoder(message_encoding: str, schema: Schema, distro: str) -> Decoder:
+    name, text = ros_name(schema.name), schema.data.decode("utf-8")
+    read = _read_ros1 if message_encoding == "ros1" else _read_cdr
+    if not text.strip():  # recorders that cannot find a definition leave its text empty
+        stock = _stock_types("ros1" if message_encoding == "ros1" else distro, name)
+        if stock is not None:
+            return partial(read, stock, name)
+        if not schema.encoding:
+            raise ValueError(UNDEFINED)
+        read = partial(_read_undefined, read)
+    store = _defined_types(schema.encoding, name, text, message_encoding)
     store.get_msgdef(name)  # fails now, rather than at the first message, when a type is missing
+    return partial(read, store, name)
 
-    def decode(data: bytes) -> Any:
-        return store.deserialize_cdr(data, name)
 
-    return decode
+def _read_undefined(read: Callable[[Typestore, str, bytes], Any], store: Typestore, name: str, data: bytes) -> Any:
+    """A message of a type without a definition: one that has no members, or else it cannot be read."""
+    try:
+        return read(store, name, data)
+    except SerdeError:
+        raise ValueError(UNDEFINED) from None
+
+
+def _read_ros1(store: Typestore, name: str, data: bytes) -> Any:
+    return store.deserialize_ros1(data, name)
+
+
+def _read_cdr(store: Typestore, name: str, data: bytes) -> Any:
+    """A CDR message; one that rosbag2 compressed by itself is inflated first. CDR begins with a zero byte, so neither passes for the
+    other, and a part of a bag stands without the metadata.yaml that says so."""
+    if data.startswith(ZSTD_MAGIC):
+        data = _inflated_message(data)
+    return store.deserialize_cdr(data, name)
+
+
+def _inflated_message(packed: bytes) -> bytes:
+    size = zstandard.frame_content_size(packed)
+    if size > limits.RECORD_BYTES:
+        raise ValueError(f"a message of {size:,} bytes, where {limits.RECORD_BYTES:,} are allowed")
+    largest = size if size > 0 else min(limits.RECORD_BYTES, 1000 * len(packed) + (1 << 20))
+    return zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW).decompress(packed, max_output_size=largest)
+
+
+@lru_cache(maxsize=512)
+def _defined_types(schema_encoding: str, name: str, text: str, message_encoding: str) -> Typestore:
+    """The types that a schema's text defines. Kept, since logs of one robot have the same ones."""
+    if schema_encoding in ("ros1msg", "ros2msg"):
+        types = get_types_from_msg(text, name)
+    elif schema_encoding in ("ros2idl", "omgidl"):
+        types = get_types_from_idl(text)
+    else:
+        raise ValueError(f"unknown schema encoding {schema_encoding!r}")
+    refuse_unreasonable(types, empty_takes_bytes=message_encoding == "cdr")
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
+
+
+def _stock_types(distro: str, name: str) -> Typestore | None:
+    """The message types of a ROS release, or of the latest where that one lacks `name` or is not known; None where both do."""
+    first = Stores.ROS1_NOETIC if distro == "ros1" else _release(distro)
+    for release in (first, Stores.LATEST):
+        if release is not None and name in (store := _stock(release)).fielddefs:
+            return store
+    return None
+
+
+def _release(distro: str) -> Stores | None:
+    return Stores.__members__.get(f"ROS2_{distro.upper()}")
 
 
 @cache
-def _stock_types() -> Typestore:
-    """The message types that ship with ROS 2."""
-    return get_typestore(Stores.LATEST)
-
-
-def _full_name(name: str) -> str:
-    """`pkg/Type`, as some recorders write it, is `pkg/msg/Type`."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+def _stock(release: Stores) -> Typestore:
+    return get_typestore(release)

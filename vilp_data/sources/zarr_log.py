@@ -17,14 +17,26 @@ import numpy.typing as npt
 import zarr
 from zarr.errors import BaseZarrError
 
-from vilp_data.errors import LogError, UsageError, nearest
+from vilp_data.errors import LogError, nearest
+from vilp_data.sources.folder_hash import folder_sha256
+from vilp_data.sources.row_clock import RowClock
 from vilp_data.types import I64, LogEpisode, Message, TopicInfo
 
 RECOPY = "copy the folder again from its source"
 LAYOUT = "expected the diffusion-policy layout: arrays under data/ and row counts in meta/episode_ends"
 
 # What zarr and its codecs raise for damaged metadata or chunks.
-BROKEN = (BaseZarrError, KeyError, ValueError, RuntimeError, TypeError, OSError)
+BROKEN = (
+    BaseZarrError,
+    KeyError,
+    ValueError,
+    RuntimeError,
+    TypeError,
+    OSError,
+    SystemError,
+    MemoryError,
+    OverflowError,
+)
 
 
 class ZarrLog:
@@ -36,24 +48,14 @@ class ZarrLog:
     format = "zarr"
 
     def __init__(self, path: Path, *, array_rate_hz: float) -> None:
-        if not array_rate_hz > 0:
-            raise UsageError(f"array_rate_hz must be positive, not {array_rate_hz}", where=path)
+        self._clock = RowClock.at(array_rate_hz, path)
+        self.assumed_rate_hz = array_rate_hz
         self.path = path
-        self._rate_hz = array_rate_hz
         self._arrays, self._ends = _open_store(path)
         self._cached: dict[str, tuple[int, npt.NDArray[Any]]] = {}  # topic -> (chunk number, its rows)
 
     def sha256(self) -> str:
-        digest = hashlib.sha256()
-        for file in sorted(self.path.rglob("*"), key=lambda file: file.relative_to(self.path).as_posix()):
-            if file.is_file():
-                digest.update(
-                    file.relative_to(self.path).as_posix().encode() + b"\0" + file.stat().st_size.to_bytes(8, "little")
-                )
-                with file.open("rb") as stream:
-                    while block := stream.read(1 << 20):
-                        digest.update(block)
-        return digest.hexdigest()
+        return folder_sha256(self.path)
 
     def demonstration_sha256(self, name: str) -> str:
         """SHA-256 of one demonstration: where its rows begin, and their values in every array under data/, whatever the chunks and
@@ -86,7 +88,7 @@ class ZarrLog:
 
     def episodes(self) -> list[LogEpisode]:
         return [
-            LogEpisode(name, self._time_ns(start), self._time_ns(end))
+            LogEpisode(name, self._clock.time_ns(start), self._clock.time_ns(end))
             for name, (start, end) in self._row_ranges().items()
         ]
 
@@ -102,14 +104,13 @@ class ZarrLog:
         for topic in topics:
             if topic not in self._arrays:
                 raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, self._arrays))
-        first = 0 if start_ns is None else self._first_row_at(start_ns)
-        stop = self.n_rows if end_ns is None else self._first_row_at(end_ns)
+        first = 0 if start_ns is None else self._clock.first_row_at(start_ns)
+        stop = self.n_rows if end_ns is None else min(self._clock.first_row_at(end_ns), self.n_rows)
         return self._rows(sorted(set(topics)), first, stop)
 
     def message_times(self) -> tuple[dict[str, I64], bool]:
         """Topic -> log times [n]; and True, for they are all."""
-        times = np.array([self._time_ns(row) for row in range(self.n_rows)], np.int64)
-        return dict.fromkeys(self._arrays, times), True
+        return dict.fromkeys(self._arrays, self._clock.times_ns(0, self.n_rows)), True
 
     def first_messages(self, topic: str, limit: int) -> list[Message]:
         """The first `limit` rows of one array."""
@@ -125,7 +126,7 @@ class ZarrLog:
 
     def _rows(self, topics: list[str], first: int, stop: int) -> Iterator[Message]:
         for row in range(first, stop):
-            time_ns = self._time_ns(row)
+            time_ns = self._clock.time_ns(row)
             for topic in topics:
                 number, offset = divmod(row, self._arrays[topic].chunks[0])
                 yield Message(topic, "array", time_ns, time_ns, self._chunk(topic, number)[offset])
@@ -162,16 +163,6 @@ class ZarrLog:
                     found="no such file; zarr would read it as its fill value",
                     remedy=f"{RECOPY}; if those rows really are empty, write the store with write_empty_chunks=True",
                 )
-
-    def _time_ns(self, row: int) -> int:
-        return round(row * 1e9 / self._rate_hz)
-
-    def _first_row_at(self, time_ns: int) -> int:
-        """The first row at or after a time, at most n_rows."""
-        row = min(max(int(time_ns * self._rate_hz / 1e9) - 1, 0), self.n_rows)
-        while row < self.n_rows and self._time_ns(row) < time_ns:
-            row += 1
-        return row
 
 
 def _bytes_of(rows: npt.NDArray[Any]) -> bytes | memoryview:

@@ -1,0 +1,110 @@
+"""metadata.yaml, which makes a folder of files one ROS 2 bag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from vilp_data.errors import LogError
+
+FILE_NAME = "metadata.yaml"
+KEY = "rosbag2_bagfile_information"
+LARGEST_BYTES = 16 << 20  # of a metadata.yaml; one of 94 topics has 18 kB
+STORAGES = (".mcap", ".db3")
+COMPRESSED_SUFFIX = ".zstd"
+REINDEX = "`ros2 bag reindex FOLDER`, where ROS 2 is installed, writes it anew; or give the bag's files one by one"
+
+
+@dataclass(frozen=True)
+class BagMetadata:
+    """`files` in the order of recording; `custom` is what the recorder was told to note (`--custom-data`); `release` of ROS 2 and
+    `compression` ("zstd, file") are empty where nothing tells."""
+
+    files: tuple[Path, ...]
+    custom: dict[str, str]
+    release: str
+    compression: str
+
+
+def is_bag_folder(folder: Path) -> bool:
+    """Whether a folder is a ROS 2 bag, in whatever state: its metadata.yaml says so."""
+    try:
+        with (folder / FILE_NAME).open("rb") as stream:
+            return KEY.encode() in stream.read(LARGEST_BYTES)
+    except OSError:
+        return False
+
+
+def lone_file(folder: Path) -> Path | None:
+    """The file that a bag's folder stands for: where there is one, not compressed, and metadata.yaml has nothing to add. Else None."""
+    metadata = read_metadata(folder)
+    plain = len(metadata.files) == 1 and metadata.files[0].suffix in STORAGES and not metadata.custom
+    return metadata.files[0] if plain else None
+
+
+def read_metadata(folder: Path) -> BagMetadata:
+    """LogError where metadata.yaml cannot be understood, or a file that it lists is not there."""
+    table = _table(folder / FILE_NAME)
+    names = table.get("relative_file_paths")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
+        raise _unusable(folder, "no list relative_file_paths")
+    files = tuple(_file(folder, name) for name in names)
+    missing = [name for name, file in zip(names, files, strict=True) if file is None]
+    if missing:
+        raise LogError(
+            "files of the bag are missing",
+            where=folder,
+            found=", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else ""),
+            remedy=f"put them back beside metadata.yaml; {REINDEX}",
+        )
+    custom = table.get("custom_data")
+    return BagMetadata(
+        files=tuple(dict.fromkeys(file for file in files if file is not None)),
+        custom={str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {},
+        release=_word(table, "ros_distro"),
+        compression=", ".join(
+            filter(None, (_word(table, "compression_format"), _word(table, "compression_mode").lower()))
+        ),
+    )
+
+
+def _table(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(LARGEST_BYTES + 1)
+        if len(text) > LARGEST_BYTES:
+            raise _unusable(path.parent, f"more than {LARGEST_BYTES:,} bytes")
+        content = YAML(typ="safe", pure=True).load(text)
+    except OSError as error:
+        raise LogError("cannot be opened", where=path, found=error.strerror, remedy="check its permissions") from error
+    except (YAMLError, ValueError, RecursionError, TypeError, KeyError, AttributeError, IndexError) as error:
+        raise _unusable(path.parent, (str(error) or repr(error)).partition("\n")[0]) from error
+    table = content.get(KEY) if isinstance(content, dict) else None
+    if not isinstance(table, dict):
+        raise _unusable(path.parent, f"no table {KEY}")
+    return table
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    """The file of the bag called `name`, None where it is not there. Only the last part of a name counts: early versions put the
+    folder before it, and no other may lead out of the folder."""
+    plain = PurePosixPath(name.replace("\\", "/")).name
+    if not plain or "\0" in plain:
+        return None
+    for candidate in (folder / plain, folder / (plain + COMPRESSED_SUFFIX)):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def _word(table: dict[str, Any], name: str) -> str:
+    value = table.get(name)
+    return value if isinstance(value, str) and value.lower() not in ("none", "unknown") else ""
+
+
+def _unusable(folder: Path, found: str) -> LogError:
+    return LogError("metadata.yaml cannot be understood", where=folder, found=found, remedy=REINDEX)
