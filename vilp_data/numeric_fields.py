@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from vilp_data.message_body import set_members
+from vilp_data.message_body import member_names, set_members
 from vilp_data.types import Message
+from vilp_data.usual_fields import PARTS_OF
 
 LARGEST_VECTOR = 32
 """Longer arrays are images, scans or matrices rather than something to plot."""
@@ -31,6 +32,36 @@ def numeric_series(message: Message) -> Series:
         group, name = ".".join(path[:-1]), path[-1]
         series.setdefault(group, {})[name] = value
     return series
+
+
+def numeric_paths(body: Any) -> list[str]:
+    """Every path at which a message holds numbers, as a task's `fields` would name it: `position[0:7]` for a list, `pose.position`
+    for a point, `speed` for a number. Header stamps are left out, and so are lists of messages past their first item."""
+    if isinstance(body, np.ndarray | np.generic):
+        return [f"[0:{len(np.asarray(body))}]"] if body.ndim and body.dtype.kind in "fiub" else []
+    return list(_paths(body, "", 0))
+
+
+def _paths(value: Any, path: str, depth: int) -> Iterator[str]:
+    if depth > MAX_DEPTH:
+        return
+    if isinstance(value, bool | int | float | np.number | np.bool_):
+        yield path
+    elif isinstance(value, np.ndarray) or _is_list(value):
+        if len(value) and (
+            value.dtype.kind in "fiub" if isinstance(value, np.ndarray) else _numbers(value) is not None
+        ):
+            yield f"{path}[0:{len(value)}]"
+        elif len(value) and not isinstance(value, np.ndarray):
+            yield from _paths(value[0], f"{path}[0]", depth + 1)
+    else:
+        names = member_names(value)
+        if path and frozenset(names) in PARTS_OF:
+            yield path
+            return
+        for name, inside in set_members(value):
+            if name not in STAMPS:
+                yield from _paths(inside, f"{path}.{name}" if path else name, depth + 1)
 
 
 def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:

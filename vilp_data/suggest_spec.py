@@ -1,0 +1,398 @@
+"""A task TOML for a log that nobody has described yet: `suggest_spec(path)` says what it would read, and why.
+
+It is a beginning. What only the user knows, above all which topic is the action, stands there as a line to un-comment."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vilp_data.errors import LogError
+from vilp_data.log_summary import GLANCE, LogSummary, TopicSummary, summarise
+from vilp_data.model_size import common_size, cut_share
+from vilp_data.sources import IndexedLog, open_log
+from vilp_data.spec import parse_task
+from vilp_data.topic_roles import TopicRole, role_of, words_of
+from vilp_data.transforms import links_of
+from vilp_data.types import F64, I64, Message
+
+ONE_CLOCK_S = 1.0
+"""Header stamps this near log time may stand beside topics that are read by log time."""
+
+LONGEST_LIST = 16  # topics of no use that are named
+FASTEST_HZ = 30.0  # for a task without cameras
+PAUSE_S, PAUSE_PERIODS = 2.0, 20
+SLOW_HZ = 5.0  # below it the usual stale_after_s would mask half of the steps
+CAMERA_WORDS = {
+    *(
+        "camera",
+        "cam",
+        "image",
+        "images",
+        "img",
+        "raw",
+        "rect",
+        "color",
+        "colour",
+        "rgb",
+        "compressed",
+        "compresseddepth",
+        "data",
+    ),
+    *("sensor", "sensors", "observation", "observations", "obs", "video", "h264", "depth", "view", "topic"),
+}
+"""Words of a camera topic that do not tell one camera from another."""
+
+TOOL_WORDS = ("tool", "tcp", "ee", "gripper", "hand", "flange", "wrist")
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What was found in a log."""
+
+    summary: LogSummary
+    cameras: list[TopicRole]
+    doubles: dict[str, str]
+    states: list[TopicRole]
+    commands: list[TopicRole]
+    others: list[TopicRole]
+    frames: list[TopicRole]
+    unused: list[TopicRole]
+    pause_s: float | None
+
+    def table(self, topic: str) -> TopicSummary:
+        return next(found for found in self.summary.topics if found.name == topic)
+
+
+def suggest_spec(path: Path, *, name: str | None = None) -> str:
+    """The text of a task TOML for the log at `path`. Raises what `open_log` raises, and LogError where nothing in the log could be
+    read by a task."""
+    look = _look(path)
+    if not look.cameras and not look.states and not look.others:
+        found = "; ".join(f"{role.topic}: {role.why}" for role in look.unused[:3]) or "no messages"
+        raise LogError(
+            "no camera and no numbers that a task could read", where=path, found=found, remedy="name another log"
+        )
+    clocks = _clocks(look)
+    names = _Names()
+    low_dim, parts = _low_dim_lines(look, clocks, names)
+    lines = [
+        f"# A task for {path.name}, suggested by `vilp-data inspect --suggest-spec`.",
+        "# Change what you know better; docs/task_toml.md has every key.",
+        f'name = "{_plain(name or path.stem) or "task"}"',
+        _rate_line(look),
+        "",
+        *low_dim,
+        *_action_lines(look, clocks, names, parts),
+        *_episodes_lines(look),
+        *_view_lines(look, clocks, names),
+        *_unused_lines(look),
+    ]
+    text = "\n".join(lines).rstrip("\n") + "\n"
+    parse_task(text, where=f"the task suggested for {path}")
+    return text
+
+
+# --- looking ------------------------------------------------------------------------------------------------------------
+
+
+def _look(path: Path) -> _Look:
+    summary = summarise(path)
+    with open_log(path) as log:
+        roles = [_role(log, topic) for topic in summary.topics if topic.n_messages != 0]
+        doubles = _doubles([role for role in roles if role.kind == "camera"])
+        cameras = [role for role in roles if role.kind == "camera" and role.topic not in doubles]
+        states = [role for role in roles if role.kind == "state"]
+        others = [role for role in roles if role.kind == "other"]
+        if not cameras and not states and others:
+            states, others = others[:1], others[1:]
+        times, complete = log.message_times()
+        pause_s = (
+            _pause_s([times[role.topic] for role in (*cameras, *states) if role.topic in times]) if complete else None
+        )
+    return _Look(
+        summary, cameras, doubles, states, [role for role in roles if role.kind == "command"], others,
+        [role for role in roles if role.kind == "frames" and not role.topic.endswith("_static")],
+        [role for role in roles if role.kind == "unused"], pause_s if summary.n_episodes == 1 else None,
+    )  # fmt: skip
+
+
+def _role(log: IndexedLog, topic: TopicSummary) -> TopicRole:
+    try:
+        messages = log.first_messages(topic.name, GLANCE)
+    except LogError as error:
+        return TopicRole(topic.name, "unused", f"{error.what}: {error.found}" if error.found else error.what)
+    if not messages:
+        return TopicRole(topic.name, "unused", "its first messages cannot be found")
+    role = role_of(topic.name, messages)
+    if role.kind == "camera" and topic.rate_hz is None:
+        return TopicRole(topic.name, "unused", f"{role.why}, but one message only")
+    if role.kind == "frames" and role.frames and not topic.name.endswith("_static"):
+        pair, frames = _frame_pair(log, topic.name, messages)
+        return replace(role, why=pair, frames=frames)
+    return role
+
+
+def _frame_pair(log: IndexedLog, topic: str, messages: Sequence[Message]) -> tuple[str, tuple[str, ...]]:
+    """ "from -> to": the root of the tree, and of the frames without a child the one that is called like a tool, else the lowest; and
+    every frame there is."""
+    links = [link for message in messages for link in links_of(message, clock="log")]
+    if any(known.name == f"{topic}_static" and known.message_count != 0 for known in log.topics()):
+        links += [
+            link for message in log.first_messages(f"{topic}_static", GLANCE) for link in links_of(message, clock="log")
+        ]
+    parent = {link.child: link.parent for link in links}
+    leaves = sorted(set(parent) - set(parent.values())) or sorted(parent)
+
+    def above(frame: str) -> list[str]:
+        chain = [frame]
+        while chain[-1] in parent and parent[chain[-1]] not in chain:
+            chain.append(parent[chain[-1]])
+        return chain
+
+    def is_tool(frame: str) -> bool:
+        return any(word.rstrip("0123456789") in TOOL_WORDS for word in words_of(frame))
+
+    leaf = max(leaves, key=lambda frame: (is_tool(frame), len(above(frame)), frame))
+    frames = {name for link in links for name in (link.parent, link.child)}
+    return f"{above(leaf)[-1]} -> {leaf}", tuple(sorted(frames))
+
+
+def _doubles(cameras: Sequence[TopicRole]) -> dict[str, str]:
+    """Topics that show what another one shows too (raw beside compressed), and which: the compressed one is smaller to read."""
+    groups: dict[str, list[TopicRole]] = {}
+    for role in cameras:
+        base = re.sub(r"/(compressed|image_raw|image_rect_color|image_color|image|h264|theora|ffmpeg)$", "", role.topic)
+        base = re.sub(r"/(image_raw|image_rect_color|image_color|image)$", "", base)
+        groups.setdefault(f"{base} {role.picture.depth_unit if role.picture else None}", []).append(role)
+    doubles = {}
+    for roles in groups.values():
+        best = max(roles, key=lambda role: (role.topic.endswith("/compressed"), role.topic))
+        doubles.update({role.topic: best.topic for role in roles if role is not best})
+    return doubles
+
+
+def _pause_s(times: Sequence[I64]) -> float | None:
+    """A silence on all topics at once that parts demonstrations: well above the usual interval; None where there is none."""
+    if not times or sum(map(len, times)) < 3:
+        return None
+    stamps = np.unique(np.concatenate(times))
+    gaps_s: F64 = np.diff(stamps) / 1e9
+    pauses = gaps_s[gaps_s > max(PAUSE_S, PAUSE_PERIODS * float(np.median(gaps_s)))] if len(gaps_s) else gaps_s
+    return float(f"{pauses.min() / 2:.2g}") if len(pauses) else None
+
+
+# --- writing ------------------------------------------------------------------------------------------------------------
+
+
+class _Names:
+    """Names that were not given yet."""
+
+    def __init__(self) -> None:
+        self._given: set[str] = set()
+
+    def new(self, wanted: str) -> str:
+        base, number = _plain(wanted) or "part", 2
+        name = base
+        while name in self._given:
+            name, number = f"{base}_{number}", number + 1
+        self._given.add(name)
+        return name
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_-")
+
+
+def _part_name(topic: str) -> str:
+    """`/left/joint_states` is left_joint_states; words that say nothing are left out."""
+    words = [word for word in words_of(topic) if word not in ("observation", "obs", "msg", "data")]
+    return "_".join(words[-3:])
+
+
+def _view_name(topic: str) -> str:
+    words = words_of(topic)
+    telling = [word for word in words if word not in CAMERA_WORDS]
+    return (
+        "_".join(telling[-2:])
+        or "_".join(word for word in words if word in ("cam", "camera", "image", "img"))[:20]
+        or "camera"
+    )
+
+
+def _toml(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _clocks(look: _Look) -> dict[str, tuple[str, str]]:
+    """Topic -> its clock and the reason. Headers are better (the recorder's delay is not in them), but one task has one time."""
+    roles = [*look.cameras, *look.states, *look.commands, *look.others, *look.frames]
+    lags = [role.header_lag_s for role in (*look.cameras, *look.states, *look.commands)]
+    known = [lag for lag in lags if lag is not None]
+    agree = bool(known) and len(known) == len(lags) and max(known) - min(known) <= ONE_CLOCK_S
+    clocks = {}
+    for role in roles:
+        if role.header_lag_s is None:
+            clocks[role.topic] = "log", "its header stamps tell no time" if role.stamped else ""
+        elif abs(role.header_lag_s) <= ONE_CLOCK_S or agree:
+            clocks[role.topic] = "header", ""
+        else:
+            clocks[role.topic] = (
+                "log",
+                f"header stamps lie {role.header_lag_s:.1f} s before log time, and not every topic has them",
+            )
+    return clocks
+
+
+def _rate_line(look: _Look) -> str:
+    summary = look.summary
+    if summary.assumed_rate_hz is not None:
+        return f"rate_hz = {summary.assumed_rate_hz:g}  # rows carry no time in this format: write the rate at which they were recorded"
+    rates = {role.topic: look.table(role.topic).rate_hz for role in look.cameras}
+    known = {topic: rate for topic, rate in rates.items() if rate}
+    if known:
+        slowest = min(known, key=lambda topic: known[topic])
+        return (
+            f"rate_hz = {_round(known[slowest]):g}  # that of the slowest camera, {slowest}; a lower one trains faster"
+        )
+    counted = [
+        (look.table(role.topic).n_messages or 0) / summary.duration_s for role in look.states if summary.duration_s > 0
+    ]
+    rate_hz = min([FASTEST_HZ, *(rate for rate in counted if rate > 0)])
+    return (
+        f"rate_hz = {_round(rate_hz):g}  # there is no camera to take it from; models need one, ingest and check do not"
+    )
+
+
+def _round(rate_hz: float) -> float:
+    return float(round(rate_hz)) if abs(rate_hz / max(round(rate_hz), 1) - 1) < 0.02 else float(f"{rate_hz:.3g}")
+
+
+def _entry(
+    look: _Look, role: TopicRole, clocks: dict[str, tuple[str, str]], group: Sequence[str] = (), *, held: bool = False
+) -> str:
+    """The inline table of a vector. `held`: a command, which grows no staler."""
+    items = {"topic": role.topic, "clock": clocks[role.topic][0]}
+    text = ", ".join(f"{key} = {_toml(value)}" for key, value in items.items() if (key, value) != ("clock", "header"))
+    if role.fields:
+        text += f", fields = {_toml(list(role.fields))}"
+    if group:
+        text += f", names = {_toml(list(group))}"
+    rate_hz = look.table(role.topic).rate_hz
+    if not held and rate_hz is not None and rate_hz < SLOW_HZ:
+        text += f", stale_after_s = {float(f'{2.5 / rate_hz:.2g}'):g}"
+    return f"{{ {text} }}"
+
+
+def _why(role: TopicRole, clocks: dict[str, tuple[str, str]]) -> str:
+    clock = clocks[role.topic][1]
+    return role.why + (f"; {clock}" if clock else "")
+
+
+def _low_dim_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names) -> tuple[list[str], list[str]]:
+    """The lines, and the names of the parts that are not commented out."""
+    lines, given = [], []
+    for role in (*look.states, *look.others[:LONGEST_LIST]):
+        hidden = "" if role in look.states else "# "
+        for group in role.name_groups or ((),):
+            part = names.new(_part_name(role.topic))
+            lines.append(f"{hidden}low_dim.{part} = {_entry(look, role, clocks, group)}  # {_why(role, clocks)}")
+            given += [] if hidden else [part]
+    for role in look.frames[:LONGEST_LIST]:
+        base, tool = role.why.split(" -> ")
+        clock = "" if clocks[role.topic][0] == "header" else ', clock = "log"'
+        pair = f"from_frame = {_toml(base)}, to_frame = {_toml(tool)}"
+        shown = ", ".join(role.frames[:LONGEST_LIST]) + (", …" if len(role.frames) > LONGEST_LIST else "")
+        lines.append(
+            f"# low_dim.{names.new(_plain(tool))} = {{ topic = {_toml(role.topic)}{clock}, {pair} }}  # frames: {shown}"
+        )
+    head = "# What a policy sees besides images; parts are concatenated in this order."
+    return ([head, *lines, ""] if lines else []), given
+
+
+def _action_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names, parts: Sequence[str]) -> list[str]:
+    sure = len(look.commands) == 1
+    lines = []
+    for role in look.commands:
+        hidden = "" if sure else "# "
+        delta = ', kind = "delta"' if set(words_of(role.topic)) & {"delta", "dpos", "deltas"} else ""
+        for group in role.name_groups or ((),):
+            entry = _entry(look, role, clocks, group, held=True)[:-2] + delta + " }"
+            lines.append(f"{hidden}action.{names.new(_part_name(role.topic))} = {entry}  # {_why(role, clocks)}")
+    for part in parts if not sure else ():
+        lines.append(
+            f'# action.{names.new(part + "_next")} = {{ from = "{part}", shift = 1 }}  # the state one step later'
+        )
+    if sure:
+        head = "Only one topic is called like a command."
+    elif look.commands:
+        head = "Un-comment the topics that the robot obeyed; without any, episodes are only watched."
+    elif lines:
+        head = "No topic is called like a command: un-comment a line to take the state one step later for it."
+    else:
+        head = "Nothing in this log says: its episodes are only watched."
+    return [f"# What the robot was told to do. {head}", *lines, ""]
+
+
+def _episodes_lines(look: _Look) -> list[str]:
+    if look.summary.n_episodes > 1:
+        return [f"# The log's own {look.summary.n_episodes} demonstrations are taken as they are.", ""]
+    lines = []
+    if look.pause_s is not None:
+        lines.append(
+            f'# episodes = {{ by = "gap", gap_s = {look.pause_s:g} }}  # the log pauses: one demonstration between two pauses'
+        )
+    for role in (*look.others, *look.states, *look.commands):
+        if role.marks:
+            lines.append(
+                f'# episodes = {{ by = "topic", topic = {_toml(role.topic)} }}  # a demonstration while its value is true'
+            )
+    if not lines:
+        return []
+    return [
+        "# One log, several demonstrations: un-comment one, then `vilp-data ingest LOG --task FILE --preview`.",
+        *lines,
+        "",
+    ]
+
+
+def _view_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names) -> list[str]:
+    pictures = [(role, role.picture) for role in look.cameras if role.picture is not None]
+    if not pictures:
+        return []
+    size = common_size([(picture.height, picture.width) for _, picture in pictures])
+    lines = []
+    for role, picture in pictures:
+        clock, reason = clocks[role.topic]
+        cut = cut_share(size.height, size.width, picture.height, picture.width)
+        lines += [f"[views.{names.new(_view_name(role.topic))}]", f"topic = {_toml(role.topic)}  # {role.why}"]
+        lines += [f"height = {size.height}", f"width = {size.width}"]
+        lines += [f'fit = "crop"  # {cut:.0%} of the picture lies outside; "pad" keeps all of it'] if cut else []
+        lines += [f'clock = "{clock}"' + (f"  # {reason}" if reason else "")] if clock != "header" else []
+        if (rate_hz := look.table(role.topic).rate_hz) is not None and rate_hz < SLOW_HZ:
+            lines.append(f"stale_after_s = {float(f'{2.5 / rate_hz:.2g}'):g}  # {rate_hz:.2g} images a second")
+        if picture.depth_unit is not None:
+            near, far = (number * (1e-3 if picture.depth_unit == "mm" else 1.0) for number in picture.near_far)
+            near, far = float(f"{near:.2g}"), float(f"{far:.2g}")
+            far = far if far > near else near + 1.0
+            lines.append(
+                f'depth = {{ unit = "{picture.depth_unit}", near_m = {near:g}, far_m = {far:g} }}  # the range of the first image'
+            )
+        lines.append("")
+    return lines
+
+
+def _unused_lines(look: _Look) -> list[str]:
+    left = [*((topic, f"shows what {other} shows") for topic, other in look.doubles.items())]
+    left += [(role.topic, role.why) for role in look.unused]
+    left += [(role.topic, role.why) for role in look.others[LONGEST_LIST:]]
+    if not left:
+        return []
+    lines = ["# Not used:", *(f"#   {topic}: {why}" for topic, why in left[:LONGEST_LIST])]
+    return [*lines, f"#   and {len(left) - LONGEST_LIST} more"] if len(left) > LONGEST_LIST else lines
