@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 from vilp_data.errors import LogError
-from vilp_data.sources.mcap_records import CHUNK_HEAD, MAGIC, MESSAGE_HEAD, RECORD_HEAD, RECOVER, RecordReader
+from vilp_data.sources.mcap_records import CHUNK_HEAD, LAST_NS, MAGIC, MESSAGE_HEAD, RECORD_HEAD, RECOVER, RecordReader
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary_start, summary_offset_start, summary_crc
 TAIL_SIZE = FOOTER.size + len(MAGIC)
@@ -75,6 +75,9 @@ def read_index(reader: RecordReader) -> McapIndex:
     index = _from_summary(reader, summary_start, footer_start, crc) if summary_start else None
     if index is None:
         index = _from_scan(reader)
+    times = [index.last_ns or 0, *(message.log_time_ns for message in index.loose)]
+    if (latest := max(times)) > LAST_NS:
+        raise reader.damaged("its times", f"a message at {latest} ns, past the year 2262")
     index.data_end, index.data_crc = _data_end(reader, summary_start or footer_start)
     return index
 

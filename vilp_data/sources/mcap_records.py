@@ -9,14 +9,14 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
+from vilp_data import limits
 from vilp_data.errors import LogError
+from vilp_data.sources.inflate import inflate
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, content length
@@ -24,14 +24,27 @@ CHUNK_HEAD = struct.Struct(
     "<BQQQQII"
 )  # opcode, length, first and last log time, size, CRC, length of compression's name
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-LARGEST_CHUNK = 1 << 32  # bytes; a header that claims more is damaged, and must not be believed by an allocator
 
-RECOVER = (
-    "copy the file again from where it was recorded; `mcap recover` (Foxglove's command line) rescues the intact part"
-)
+LAST_NS = (1 << 63) - 1
+"""The last time that is read, in the year 2262. MCAP has room for later ones, NumPy has not: they come from damage."""
+
+RECOVER = "copy the file again from where it was recorded; `vilp-data salvage` gets back what is intact"
 
 # What the mcap library raises for a damaged record; anything else is a mistake in the code and must surface.
 BROKEN = (McapError, struct.error, ValueError, OverflowError)
+
+
+class StrictStream(ReadDataStream):  # type: ignore[misc]
+    """The mcap library's stream over a record's content. Its own takes a text that the record cuts off for a shorter one."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__(BytesIO(content))
+
+    def read(self, length: int) -> bytes:
+        data: bytes = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
 
 
 class RecordReader:
@@ -46,6 +59,8 @@ class RecordReader:
         """Exactly `length` bytes; LogError about `what` where the file does not have them."""
         if offset < 0 or offset + length > self.size:
             raise self.damaged(what, f"it would reach from byte {offset} to {offset + length} of {self.size}")
+        if length > limits.RECORD_BYTES:
+            raise limits.exceeded(what, "RECORD_BYTES", length, where=self.path)
         try:
             self._stream.seek(offset)
             data = self._stream.read(length)
@@ -76,7 +91,7 @@ class RecordReader:
     def parse(self, read: Callable[[ReadDataStream], Any], content: bytes, where: str) -> Any:
         """A record by the mcap library's own parser."""
         try:
-            return read(ReadDataStream(BytesIO(content)))
+            return read(StrictStream(content))
         except BROKEN as error:
             raise self.damaged(where, f"a record that cannot be read ({error!r})") from error
 
@@ -115,10 +130,11 @@ class RecordReader:
             if getattr(header, name) != getattr(chunk, name):
                 found = f"{name} {getattr(header, name)!r}, while the index says {getattr(chunk, name)!r}"
                 raise self.damaged(where, found)
+        limits.check(where, "CHUNK_BYTES", max(chunk.uncompressed_size, chunk.compressed_size), where=self.path)
         try:
             packed = record[begin : begin + chunk.compressed_size]
-            data = _inflated(packed, chunk.compression, chunk.uncompressed_size)
-        except (zstandard.ZstdError, RuntimeError, ValueError) as error:
+            data = inflate(packed, chunk.compression, chunk.uncompressed_size)
+        except ValueError as error:
             raise self.damaged(where, f"{chunk.compression or 'stored'} data that cannot be read ({error})") from error
         if crc and zlib.crc32(data) != crc:
             raise self.damaged(where, f"CRC {zlib.crc32(data):08x} where {crc:08x} was written")
@@ -126,23 +142,3 @@ class RecordReader:
 
     def damaged(self, where: str, found: str) -> LogError:
         return LogError(f"the log is damaged at {where}", where=self.path, found=found, remedy=RECOVER)
-
-
-def _inflated(packed: bytes, compression: str, size: int) -> bytes:
-    """The chunk's bytes; ValueError where they are not `size` long, which is looked at before any memory is taken."""
-    if size > LARGEST_CHUNK:
-        raise ValueError(f"{size} bytes in one chunk")
-    if compression == "":
-        data = packed
-    elif compression == "zstd":
-        claimed = zstandard.frame_content_size(packed)
-        if claimed not in (-1, size):
-            raise ValueError(f"a frame of {claimed} bytes where the header says {size}")
-        data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=max(size, 1))
-    elif compression == "lz4":
-        data = lz4.frame.decompress(packed)
-    else:
-        raise ValueError("known compressions: none, zstd, lz4")
-    if len(data) != size:
-        raise ValueError(f"{len(data)} bytes where the header says {size}")
-    return data

@@ -1,0 +1,112 @@
+"""Logs to be damaged, and what is in them: for the tests of salvage."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from vilp_data.errors import LogError
+from vilp_data.salvage import salvage_log
+from vilp_data.salvage_report import SalvageReport
+
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "none": {"compression": CompressionType.NONE, "chunk_size": 6000},
+    "lz4": {"compression": CompressionType.LZ4, "chunk_size": 6000},
+    "zstd": {"compression": CompressionType.ZSTD, "chunk_size": 6000},
+    "one lz4 chunk": {"compression": CompressionType.LZ4, "chunk_size": 1 << 30},
+    "one zstd chunk": {"compression": CompressionType.ZSTD, "chunk_size": 1 << 30},
+    "unchunked": {"use_chunking": False},
+}
+
+
+class Sent(NamedTuple):
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+def write_log(path: Path, *, n: int = 150, size: int = 200, extras: bool = True, **options: Any) -> list[Sent]:
+    """An MCAP of `n` messages on three topics, half noise and half not, with an attachment and a metadata record in the middle."""
+    rng = random.Random(0)
+    sent = []
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("a profile", "test")
+        schema = writer.register_schema("Thing", "jsonschema", b'{"type": "object"}')
+        channels = [writer.register_channel(f"/topic{i}", "json", schema, {"key": "value"}) for i in range(3)]
+        for k in range(n):
+            data = rng.randbytes(rng.randrange(1, size)) + b"x" * rng.randrange(size)
+            sent.append(Sent(f"/topic{k % 3}", 1000 + 10 * k, 997 + 10 * k, k, data))
+            writer.add_message(channels[k % 3], 1000 + 10 * k, data, 997 + 10 * k, k)
+            if extras and k == n // 2:
+                writer.add_attachment(7, 5, "calibration.bin", "application/x", b"abc" * 300)
+                writer.add_metadata("episode", {"success": "true"})
+        writer.finish()
+    return sent
+
+
+def read_log(path: Path) -> list[Sent]:
+    """Every message in file order, by the mcap library, its checksums verified."""
+    with path.open("rb") as stream:
+        return [
+            Sent(channel.topic, message.log_time, message.publish_time, message.sequence, message.data)
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        ]
+
+
+def salvaged(path: Path, content: bytes | None = None, **options: Any) -> tuple[list[Sent], SalvageReport | None]:
+    """What comes back from a log (with this content), and the report; None where nothing does."""
+    if content is not None:
+        path.write_bytes(content)
+    out = path.with_suffix(".salvaged")
+    try:
+        report = salvage_log(path, out, force=True, **options)
+    except LogError:
+        return [], None
+    found = read_log(out)
+    assert report.recovered == len(found)
+    return found, report
+
+
+def invented(found: list[Sent], sent: list[Sent]) -> int:
+    """How many messages came back that nobody sent."""
+    return (Counter(found) - Counter(sent)).total()
+
+
+def cuts(content: bytes, *, steps: int) -> list[bytes]:
+    """The content up to each of `steps` equal parts of its length."""
+    return [content[: len(content) * step // steps] for step in range(1, steps + 1)]
+
+
+def mutated(content: bytes, rng: random.Random) -> bytes:
+    """The content with one to five changes: bits flipped, bytes overwritten, zeroed, left out or put in."""
+    changed = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        if changed:
+            _change(changed, rng.randrange(len(changed)), rng.randrange(1, 300), rng)
+    return bytes(changed)
+
+
+def _change(content: bytearray, place: int, many: int, rng: random.Random) -> None:
+    """One change of a kind drawn at random; most are a single bit."""
+    run = slice(place, place + many)
+    kind = rng.choices(range(6), (4, 2, 1, 1, 1, 1))[0]
+    if kind == 0:
+        content[place] ^= 1 << rng.randrange(8)
+    elif kind == 1:
+        content[place] = rng.choice((0, 1, 127, 128, 255))
+    elif kind == 2:
+        content[place : place + 8] = b"\xff" * len(content[place : place + 8])
+    elif kind == 3:
+        content[run] = bytes(len(content[run]))
+    elif kind == 4:
+        del content[run]
+    else:
+        content[place:place] = rng.randbytes(many)

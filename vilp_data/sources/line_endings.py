@@ -1,0 +1,220 @@
+"""Logs whose line endings a transfer converted, as git without .gitattributes and FTP in text mode do: told, and undone where they can be.
+
+Each line feed that became carriage return + line feed is found again without doubt. The other way, where a pair became a line feed,
+a pair left no trace; but an MCAP chunk says how long it was, and its checksum says when it is right, so the few line feeds that lost
+their return are found by trial. What no checksum vouches for stays as it is.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from itertools import combinations
+from math import comb
+from typing import NamedTuple
+
+import zstandard
+from mcap.opcode import Opcode
+
+from vilp_data.sources.inflate import UNFINISHED, inflate, inflate_prefix
+from vilp_data.sources.mcap_records import CHUNK_HEAD, MAGIC, RECORD_HEAD
+
+RETURNED = (b"\x89MCAP0\r\r\n", b"#ROSBAG V2.0\r\n")
+FED = (b"\x89MCAP0\n",)
+MOST_TRIALS = 20_000
+"""Ways to put returns back into one zstd block or chunk; beyond that it is left as it is."""
+LARGEST_CHUNK = 1 << 26
+"""Of chunks that are tried."""
+MOST_BYTES = 1 << 34
+"""Inflated for trials, of the whole log: half a minute."""
+
+
+class _Budget:
+    """What may still be spent on trials."""
+
+    def __init__(self, left: int = MOST_BYTES) -> None:
+        self.left = left
+
+    def allows(self, size: int) -> bool:
+        self.left -= size
+        return self.left > 0
+
+
+class Restored(NamedTuple):
+    """The log's bytes as they were, or as near as can be had; `what` says in words what was done."""
+
+    data: bytes
+    what: str
+
+
+def is_converted(head: bytes) -> bool:
+    """Whether a log that begins with these bytes went through a conversion of line endings."""
+    return head.startswith(RETURNED) or head.startswith(FED)
+
+
+def restored(data: bytes) -> Restored:
+    """The log before the conversion; `data` begins as `is_converted` says."""
+    if data.startswith(RETURNED):
+        lone = data.replace(b"\r\n", b"").count(b"\n")
+        what = "its line feeds had become pairs (\\r\\n): turned back"
+        if lone:
+            what += f"; {lone} line feeds were not converted, so not every pair need have been a line feed"
+        return Restored(data.replace(b"\r\n", b"\n"), what)
+    return _with_returns(data)
+
+
+# --- pairs that became line feeds ---------------------------------------------------------------------------------------------
+
+
+def _with_returns(data: bytes) -> Restored:
+    """An MCAP file whose pairs became line feeds, its chunks made whole again by trial."""
+    out = bytearray(MAGIC)
+    position, found, budget = len(FED[0]), 0, _Budget()
+    while position < len(data):
+        chunk = _chunk_at(data, position, budget)
+        if chunk is not None:
+            record, position = chunk
+            out += record
+            found += 1
+            continue
+        told = _record_length(data, position)
+        if told is None:
+            out += data[position:]
+            break
+        length, lacks = told
+        if (
+            not lacks or data[position] != Opcode.MESSAGE_INDEX
+        ):  # an index that lacks bytes is worth nothing, and made anew
+            out += data[position : position + length]
+        position += length
+    what = f"its pairs \\r\\n had become line feeds: {found} chunks made whole again, as their checksums say"
+    return Restored(bytes(out), what)
+
+
+def _record_length(data: bytes, position: int) -> tuple[int, int] | None:
+    """(length, returns that it lacks) of the record here: as many as it takes that another record follows."""
+    if position + RECORD_HEAD.size > len(data):
+        return None
+    opcode, length = RECORD_HEAD.unpack_from(data, position)
+    if not 0 < opcode < 16 or length > len(data):
+        return None
+    for missing in range(3):
+        end = position + RECORD_HEAD.size + length - missing
+        if _follows(data, end):
+            return int(end - position), missing
+    return None
+
+
+def _follows(data: bytes, end: int) -> bool:
+    """Whether a record head, or the end of the file, is here."""
+    if end == len(data) or data[end:] in (MAGIC, FED[0]):
+        return True
+    head = data[end : end + RECORD_HEAD.size]
+    if len(head) < RECORD_HEAD.size:
+        return False
+    opcode, length = RECORD_HEAD.unpack(head)
+    return bool(0 < opcode < 16 and 0 < length <= len(data))
+
+
+def _chunk_at(data: bytes, position: int, budget: _Budget) -> tuple[bytes, int] | None:
+    """The chunk record here with its returns, and where the next record begins; None where it is none, or no trial is right."""
+    if position + CHUNK_HEAD.size + 12 > len(data) or data[position] != 6:
+        return None
+    _, length, _, _, size, crc, name_length = CHUNK_HEAD.unpack_from(data, position)
+    at = position + CHUNK_HEAD.size + name_length
+    name = data[position + CHUNK_HEAD.size : at]
+    if name not in (b"", b"lz4", b"zstd") or not crc or length > len(data):
+        return None
+    packed_size = int.from_bytes(data[at : at + 8], "little")
+    head, begin = data[position : at + 8], at + 8
+    for missing in range(64):
+        end = begin + packed_size - missing
+        if end < begin or not _follows(data, end):
+            continue
+        packed = _completed(data[begin:end], missing, name.decode(), size, crc, budget)
+        if packed is not None:
+            return head + packed, end
+    return None
+
+
+def _completed(packed: bytes, missing: int, compression: str, size: int, crc: int, budget: _Budget) -> bytes | None:
+    """`packed` with `missing` returns put before line feeds so that it inflates to what the checksum says."""
+    for trial in _trials(packed, missing, compression, size, budget):
+        if not budget.allows(size):
+            return None
+        try:
+            if zlib.crc32(inflate(trial, compression, size)) == crc:
+                return trial
+        except ValueError:
+            continue
+    return None
+
+
+def _trials(packed: bytes, missing: int, compression: str, size: int, budget: _Budget) -> Iterator[bytes]:
+    if compression == "zstd" and missing:
+        yield from _zstd_trials(packed, missing, size, budget)
+        return
+    feeds = [place for place, byte in enumerate(packed) if byte == 10]
+    if comb(len(feeds), missing) <= MOST_TRIALS:
+        yield from (_with_pairs(packed, places) for places in combinations(feeds, missing))
+
+
+def _with_pairs(packed: bytes, places: tuple[int, ...]) -> bytes:
+    out, begin = bytearray(), 0
+    for place in places:
+        out += packed[begin:place] + b"\r"
+        begin = place
+    return bytes(out + packed[begin:])
+
+
+def _zstd_trials(packed: bytes, missing: int, size: int, budget: _Budget) -> Iterator[bytes]:
+    """Block by block: a block's header says how long it was, and most wrong trials do not inflate."""
+    if size > LARGEST_CHUNK:
+        return
+    try:
+        start = zstandard.frame_header_size(packed[:18])
+    except zstandard.ZstdError:
+        return
+    yield from _zstd_from(packed, start, missing, size, budget)
+
+
+def _zstd_from(packed: bytes, position: int, missing: int, size: int, budget: _Budget) -> Iterator[bytes]:
+    """`packed` is right up to `position`, where a block's header lies, and lacks `missing` returns behind it."""
+    if missing == 0:
+        yield packed
+        return
+    header = int.from_bytes(packed[position : position + 3], "little")
+    last, kind, length = header & 1, header >> 1 & 3, header >> 3
+    if position + 3 > len(packed) or kind == 3:
+        return
+    length = 1 if kind == 1 else length
+    for here in range(missing + 1):
+        if last and here != missing:
+            continue
+        end = position + 3 + length - here
+        if not last and not _is_block_header(packed[end : end + 3]):
+            continue
+        block = packed[position + 3 : end]
+        feeds = [place for place, byte in enumerate(block) if byte == 10]
+        if comb(len(feeds), here) > MOST_TRIALS:
+            continue
+        for places in combinations(feeds, here):
+            trial = packed[: position + 3] + _with_pairs(block, places) + packed[end:]
+            after = position + 3 + length
+            if last:
+                yield trial
+            elif budget.allows(after) and _inflates_to(trial, after, size):
+                yield from _zstd_from(trial, after, missing - here, size, budget)
+            elif budget.left <= 0:
+                return
+
+
+def _is_block_header(header: bytes) -> bool:
+    value = int.from_bytes(header, "little")
+    return len(header) == 3 and value >> 1 & 3 != 3 and 0 < value >> 3 <= 1 << 17
+
+
+def _inflates_to(packed: bytes, end: int, size: int) -> bool:
+    """Whether the blocks up to `end` inflate."""
+    fault = inflate_prefix(packed[:end], "zstd", size).fault
+    return "header says" in fault or fault in ("", UNFINISHED)
