@@ -3,56 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vilp_data import shards
+from vilp_data import journal, shards
+from vilp_data.edits import Arrays, Edits, content_hash, edited
+from vilp_data.episode_entry import INDEX_SCHEMA, EpisodeEntry, Origin, entry_of, header_of, row_of
 from vilp_data.errors import StoreError, UsageError, nearest
 from vilp_data.keys import FORMAT_VERSION, content_digest
 from vilp_data.spec import TaskSpec, task_from_dict
-from vilp_data.types import U8, Episode, Outcome
+from vilp_data.types import U8, Episode
 
-
-@dataclass(frozen=True)
-class Origin:
-    """Where an episode came from: the log's file name, which demonstration in it, the SHA-256 of the log (of that demonstration's own
-    rows where the log can tell them apart), and the ingest spec used."""
-
-    source: str
-    source_sha256: str
-    source_episode: str
-    key: str
-    ingest_fields: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class EpisodeEntry:
-    """What the index knows of an episode without opening its arrays."""
-
-    id: str
-    source: str
-    source_sha256: str
-    source_episode: str
-    key: str
-    ingest: Mapping[str, Any]
-    n_steps: int
-    n_valid: int
-    rate_hz: float
-    outcome: Outcome
-    tags: Mapping[str, str]
-    findings: tuple[str, ...]
-    frames_sha256: Mapping[str, str]
-    n_frames: Mapping[str, int]
-    content_sha256: str
-    has_action: bool
-    has_state: bool
+__all__ = ["EpisodeEntry", "EpisodeStore", "Origin"]
 
 
 class EpisodeStore:
@@ -108,36 +76,36 @@ class EpisodeStore:
             return None
 
     def write_spec(self, spec: TaskSpec) -> None:
-        table = {"format": FORMAT_VERSION, "spec": spec.model_dump(mode="json", by_alias=True)}
-        data = (
-            json.dumps(table, indent=2) + "\n"
-        ).encode()  # never sorted: the order of action and low_dim parts is the order of columns
+        if not self.has_spec(spec):
+            shards.write_atomic(self.root / "dataset.json", _spec_bytes(spec))
+
+    def has_spec(self, spec: TaskSpec) -> bool:
+        """Whether dataset.json says just this."""
         path = self.root / "dataset.json"
-        if not path.is_file() or path.read_bytes() != data:
-            shards.write_atomic(path, data)
+        return path.is_file() and path.read_bytes() == _spec_bytes(spec)
 
     # --- writing
 
-    def write(self, episode: Episode, origin: Origin) -> None:
-        """Write an episode's frames, then its steps. A crash in between leaves no episode, only frames that the next run replaces."""
+    def write(self, episode: Episode, origin: Origin, *, edits: Edits | None = None, hold: Path | None = None) -> None:
+        """Write an episode's frames, then its steps. A crash in between leaves no episode, only frames that the next run replaces.
+
+        `edits` are what people decided about an earlier ingest of the same log: they are done to this one too. `hold` is the folder
+        in which files that are replaced stay for an undo. Raises UsageError where a trim leaves too little, before anything is written."""
         frames_sha256 = {view: content_digest(frames) for view, frames in episode.frames.items()}
+        entry, tensors = _entry_and_steps(episode, origin, frames_sha256)
+        if edits is not None:
+            entry, tensors = edited(entry, tensors, edits)
         steps = self.steps_path(episode.id)
+        for path in (steps, *(self.frames_path(view, episode.id) for view in episode.frames)):
+            if hold is not None and path.is_file():
+                journal.keep_link(path, hold / path.relative_to(self.root))
         if steps.is_file():
             steps.unlink()  # the commit goes first, and comes back last
             shards.sync_folder(steps.parent)
         for view, frames in episode.frames.items():
             header = {"format": str(FORMAT_VERSION), "key": origin.key, "frames_sha256": frames_sha256[view]}
             shards.write_shard(self.frames_path(view, episode.id), {"frames": frames}, header)
-        tensors: dict[str, Any] = {
-            "log_time_ns": episode.log_time_ns,
-            "low_dim": episode.low_dim,
-            "valid": episode.valid,
-        }
-        tensors |= {f"source_index/{view}": index for view, index in episode.source_index.items()}
-        tensors |= {f"age_s/{topic}": age for topic, age in episode.age_s.items()}
-        tensors |= {"action": episode.action} if episode.action is not None else {}
-        tensors |= {"state": episode.state} if episode.state is not None else {}
-        shards.write_shard(steps, tensors, _steps_header(episode, origin, frames_sha256))
+        write_steps(steps, entry, tensors)
 
     def remove_index(self) -> None:
         """Before episodes change: an index that is not there is rebuilt, one that is wrong is believed."""
@@ -147,14 +115,15 @@ class EpisodeStore:
         """Write episodes/index.parquet from the headers; nothing where there is no episode."""
         if not self._steps_files():
             return
-        rows = [_to_row(entry, self.steps_path(entry.id).stat().st_size) for entry in self._entries_from_headers()]
+        rows = [row_of(entry, self.steps_path(entry.id).stat().st_size) for entry in self._entries_from_headers()]
         with shards.atomic_file(self.index_path) as file:
-            pq.write_table(pa.Table.from_pylist(rows, schema=_INDEX_SCHEMA), file)
+            pq.write_table(pa.Table.from_pylist(rows, schema=INDEX_SCHEMA), file)
 
     # --- reading
 
     def index(self) -> list[EpisodeEntry]:
         """Every committed episode, sorted by id. Read from index.parquet where that fits the folder, else from the headers."""
+        journal.await_settled(self.root)
         sizes = {path.name.removesuffix(".safetensors"): path.stat().st_size for path in self._steps_files()}
         if self.index_path.is_file():
             try:
@@ -162,7 +131,7 @@ class EpisodeStore:
             except (pa.ArrowException, OSError):
                 rows = []  # derived and damaged: the headers know better
             if {row["id"]: row["file_bytes"] for row in rows} == sizes:
-                return [_from_row(row) for row in rows]
+                return [entry_of(row) for row in rows]
         return self._entries_from_headers()
 
     def entry(self, episode_id: str) -> EpisodeEntry:
@@ -193,7 +162,13 @@ class EpisodeStore:
         )
 
     def read_frames(self, view: str, entry: EpisodeEntry) -> U8:
-        """uint8 [n,H,W,3] of one view, checked to be the frames that the episode was committed with."""
+        """uint8 [n,H,W,3] of one view, checked to be the frames that the episode was committed with; of a trimmed episode those that
+        are left."""
+        first = entry.first_frame(view)
+        return self.read_stored_frames(view, entry)[first : first + entry.n_frames[view]]
+
+    def read_stored_frames(self, view: str, entry: EpisodeEntry) -> U8:
+        """As `read_frames`, with the frames that were trimmed off: row i of a latent shard belongs to frame i of these."""
         shard = shards.read_shard(self.frames_path(view, entry.id))
         if shard.metadata["frames_sha256"] != entry.frames_sha256[view]:
             raise StoreError(
@@ -223,66 +198,41 @@ class EpisodeStore:
             raise StoreError(
                 "written by another version", where=path, found=found, remedy="ingest the logs again into a new folder"
             )
-        return _from_row(metadata)
+        return entry_of(metadata)
 
     def _entries_from_headers(self) -> list[EpisodeEntry]:
         return sorted((self.entry_from_header(path) for path in self._steps_files()), key=lambda entry: entry.id)
 
 
-# One flat row of strings and numbers per episode, the same in a steps file's header and in index.parquet.
-_JSON_FIELDS = ("ingest", "tags", "findings", "frames_sha256", "n_frames")
-_INDEX_SCHEMA = pa.schema(
-    [
-        (name, pa.string())
-        for name in (
-            "id",
-            "source",
-            "source_sha256",
-            "source_episode",
-            "key",
-            "outcome",
-            "content_sha256",
-            *_JSON_FIELDS,
-        )
-    ]
-    + [("n_steps", pa.int64()), ("n_valid", pa.int64()), ("file_bytes", pa.int64()), ("rate_hz", pa.float64())]
-    + [("has_action", pa.bool_()), ("has_state", pa.bool_())]
-)
+def _spec_bytes(spec: TaskSpec) -> bytes:
+    table = {"format": FORMAT_VERSION, "spec": spec.model_dump(mode="json", by_alias=True)}
+    # Never sorted: the order of action and low_dim parts is the order of columns.
+    return (json.dumps(table, indent=2) + "\n").encode()
 
 
-def _steps_header(episode: Episode, origin: Origin, frames_sha256: Mapping[str, str]) -> dict[str, str]:
-    arrays = [episode.low_dim, episode.valid, *(episode.source_index[view] for view in sorted(episode.source_index))]
-    arrays += [episode.action] if episode.action is not None else []
-    row: dict[str, Any] = {
-        "format": FORMAT_VERSION, "id": episode.id, "source": origin.source, "source_sha256": origin.source_sha256,
-        "source_episode": origin.source_episode, "key": origin.key, "ingest": dict(origin.ingest_fields),
-        "n_steps": episode.n_steps, "n_valid": int(np.count_nonzero(episode.valid)), "rate_hz": episode.rate_hz,
-        "outcome": episode.outcome, "tags": dict(episode.tags), "findings": list(episode.findings),
-        "frames_sha256": dict(frames_sha256), "n_frames": {view: len(frames) for view, frames in episode.frames.items()},
-        "content_sha256": content_digest(*arrays) + "".join(frames_sha256[view] for view in sorted(frames_sha256)),
-        "has_action": int(episode.action is not None), "has_state": int(episode.state is not None),
-    }  # fmt: skip
-    row["content_sha256"] = content_digest(np.frombuffer(row["content_sha256"].encode(), np.uint8))
-    return {key: json.dumps(value, sort_keys=True) if key in _JSON_FIELDS else str(value) for key, value in row.items()}
+def write_steps(path: Path, entry: EpisodeEntry, steps: Arrays) -> None:
+    """Write an episode's steps file: its arrays by name, under the entry as header."""
+    shards.write_shard(path, steps, header_of(entry))
 
 
-def _to_row(entry: EpisodeEntry, file_bytes: int) -> dict[str, Any]:
-    row = {**entry.__dict__, "file_bytes": file_bytes}
-    return {key: json.dumps(value, sort_keys=True) if key in _JSON_FIELDS else value for key, value in row.items()}
-
-
-@lru_cache(maxsize=4096)
-def _parsed(text: str) -> Any:
-    """JSON, parsed once for all the episodes that share it (every one its ingest spec). Read-only by agreement."""
-    return json.loads(text)
-
-
-def _from_row(row: Mapping[str, Any]) -> EpisodeEntry:
-    parsed = {key: _parsed(row[key]) for key in _JSON_FIELDS}
-    return EpisodeEntry(
-        **{key: row[key] for key in ("id", "source", "source_sha256", "source_episode", "key", "outcome", "content_sha256")},
-        ingest=parsed["ingest"], tags=parsed["tags"], findings=tuple(parsed["findings"]),
-        frames_sha256=parsed["frames_sha256"], n_frames=parsed["n_frames"],
-        n_steps=int(row["n_steps"]), n_valid=int(row["n_valid"]), rate_hz=float(row["rate_hz"]),
-        has_action=bool(int(row["has_action"])), has_state=bool(int(row["has_state"])),
+def _entry_and_steps(
+    episode: Episode, origin: Origin, frames_sha256: dict[str, str]
+) -> tuple[EpisodeEntry, dict[str, npt.NDArray[Any]]]:
+    steps: dict[str, npt.NDArray[Any]] = {
+        "log_time_ns": episode.log_time_ns,
+        "low_dim": episode.low_dim,
+        "valid": episode.valid,
+    }
+    steps |= {f"source_index/{view}": index for view, index in episode.source_index.items()}
+    steps |= {f"age_s/{topic}": age for topic, age in episode.age_s.items()}
+    steps |= {"action": episode.action} if episode.action is not None else {}
+    steps |= {"state": episode.state} if episode.state is not None else {}
+    entry = EpisodeEntry(
+        id=episode.id, source=origin.source, source_sha256=origin.source_sha256, source_episode=origin.source_episode,
+        key=origin.key, ingest=dict(origin.ingest_fields), n_steps=episode.n_steps,
+        n_valid=int(np.count_nonzero(episode.valid)), rate_hz=episode.rate_hz, outcome=episode.outcome,
+        tags=dict(episode.tags), findings=tuple(episode.findings), frames_sha256=frames_sha256,
+        n_frames={view: len(frames) for view, frames in episode.frames.items()}, content_sha256="",
+        has_action=episode.action is not None, has_state=episode.state is not None,
     )  # fmt: skip
+    return replace(entry, content_sha256=content_hash(entry, steps)), steps
