@@ -1,0 +1,172 @@
+"""What every format's writer is given, and what it tells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from vilp_data.episodes import EpisodeStore
+from vilp_data.export.pieces import Chosen, Piece, Rows, Shapes, read_pieces
+from vilp_data.export.video import frame_rate
+from vilp_data.plots import vector_parts
+from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
+from vilp_data.split_lock import Side
+from vilp_data.types import F32, U8
+
+Images = Literal["h264", "h264-420", "lossless", "png"]
+
+TASK_TAGS = ("instruction", "language_instruction", "task")
+"""Tags that say in words what an episode shows; else it is the task's name."""
+
+Step = Callable[[int], None]
+"""Told how many rows more are done."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A part of a vector: its name, a label for each of its numbers, and where it lies in the vector."""
+
+    name: str
+    labels: tuple[str, ...]
+    first: int
+
+    @property
+    def span(self) -> slice:
+        return slice(self.first, self.first + len(self.labels))
+
+
+@dataclass(frozen=True)
+class ExportJob:
+    """One export. `crf` None is the default of `images`; `step` is told of rows as they are done."""
+
+    store: EpisodeStore
+    spec: TaskSpec
+    chosen: Chosen
+    shapes: Shapes
+    rate_hz: float
+    images: Images
+    crf: int | None
+    marked: bool
+    step: Step
+
+    @cached_property
+    def fps(self) -> Fraction:
+        return frame_rate(self.rate_hz)
+
+    @cached_property
+    def low_dim(self) -> tuple[Column, ...]:
+        return _columns(self.shapes.low_dim, self.spec.low_dim, "low_dim")
+
+    @cached_property
+    def action(self) -> tuple[Column, ...]:
+        return _columns(self.shapes.action or 0, self.spec.action, "action")
+
+    def read(self) -> Iterator[tuple[Piece, Rows]]:
+        """Every piece with its rows, in the order of the export."""
+        for piece, rows in read_pieces(self.store, self.chosen.pieces, self.shapes.action):
+            yield piece, rows
+            self.step(piece.n_rows)
+
+    def task_of(self, piece: Piece) -> str:
+        """What the piece shows, in words."""
+        return next((piece.entry.tags[tag] for tag in TASK_TAGS if piece.entry.tags.get(tag)), self.spec.name)
+
+    def depth_views(self) -> set[str]:
+        """Views of one channel."""
+        return {view for view, shape in self.shapes.views.items() if shape[-1] == 1}
+
+    def piece_bytes(self, piece: Piece) -> int:
+        """What a piece's rows would take without any compression."""
+        numbers = 4 * (self.shapes.low_dim + (self.shapes.action or 0)) + 8 * (self.shapes.state or 0) + 32
+        return piece.n_rows * (numbers + sum(int(np.prod(shape)) for shape in self.shapes.views.values()))
+
+    @property
+    def raw_bytes(self) -> int:
+        """The same of all rows."""
+        return sum(self.piece_bytes(piece) for piece in self.chosen.pieces)
+
+
+def _columns(width: int, parts: Mapping[str, ActionSpec | VectorSpec], whole: str) -> tuple[Column, ...]:
+    """The parts of a vector of `width` numbers, in order; one part called `whole` where the spec does not tell their widths."""
+    columns, first = [], 0
+    for name, (labels, _) in vector_parts(np.empty((0, width), np.float32), parts).items():
+        columns.append(Column(name or (next(iter(parts)) if len(parts) == 1 else whole), tuple(labels), first))
+        first += len(labels)
+    return tuple(columns)
+
+
+@dataclass
+class ViewWritten:
+    """How a view was written, and how near it came. `psnr_db`, `psnr_min_db`: of all pixels, and of the worst frame, against the stored
+    frames; None where every pixel is equal."""
+
+    where: str
+    coding: str
+    n_images: int
+    n_bytes: int = 0
+    psnr_db: float | None = None
+    psnr_min_db: float | None = None
+
+
+@dataclass
+class Written:
+    """What a writer did. `carried`: what -> where it lies; `not_carried`: what -> why, and how much."""
+
+    views: dict[str, ViewWritten] = field(default_factory=dict)
+    carried: dict[str, str] = field(default_factory=dict)
+    not_carried: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class FrameErrors:
+    """Squared errors of frames that were read back, and whether row k really holds frame k.
+
+    A codec smears, so one frame may look more like its neighbour; over an episode, the frames must be nearest to their own."""
+
+    squared: float = 0.0
+    n_values: int = 0
+    worst: float = 0.0
+    _own: float = 0.0
+    _shifted: tuple[float, float] = (0.0, 0.0)
+
+    def add(self, found: U8, before: U8 | None, stored: U8, after: U8 | None) -> None:
+        """One frame against the stored one, and those that the rows before and after it show (None at the ends)."""
+        error = _squared_error(found, stored)
+        self.squared += error
+        self.n_values += found.size
+        self.worst = max(self.worst, error / found.size)
+        earlier = _squared_error(found, before) if before is not None and error else error
+        later = _squared_error(found, after) if after is not None and error else error
+        self._own += error
+        self._shifted = self._shifted[0] + earlier, self._shifted[1] + later
+
+    def end_episode(self) -> bool:
+        """Whether the episode's frames are nearest to their own rows; the next episode begins."""
+        right = self._own <= min(self._shifted)
+        self._own, self._shifted = 0.0, (0.0, 0.0)
+        return right
+
+    def psnr_db(self) -> tuple[float | None, float | None]:
+        """Of all pixels, and of the worst frame; None where there was no error."""
+        if not self.squared:
+            return None, None
+        return _psnr(self.squared / self.n_values), _psnr(self.worst)
+
+
+def _squared_error(one: U8, other: U8) -> float:
+    difference: F32 = one.astype(np.float32) - other
+    return float(np.square(difference, out=difference).sum(dtype=np.float64))
+
+
+def _psnr(mean_squared: float) -> float:
+    return round(float(10 * np.log10(255.0**2 / mean_squared)), 2)
+
+
+def side_words(side: Side | None) -> str:
+    return {"train": "training", "val": "validation", None: "no side"}[side]
