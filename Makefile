@@ -20,11 +20,12 @@ RUN   := $(DATA)/runs/vqgan-$(PRESET)
 MODEL := --data $(DATA) --task $(TASK) --preset $(PRESET)
 SEEDS ?= $(if $(filter tiny,$(PRESET)),0:2,0:50)
 LOGS_IN := $(if $(LOGS),$(LOGS),$(DATA)/logs)
+SECONDS ?= 120
 SUDO  := $(if $(filter 0,$(shell id -u)),,$(shell command -v sudo >/dev/null && echo sudo -n))
 
 export MUJOCO_GL ?= osmesa
 
-.PHONY: setup record ingest split vqgan latents planner policy bc generate rollout view replay test test-slow lint bench docs clean help
+.PHONY: setup record ingest split vqgan latents planner policy bc generate rollout view replay test test-slow fuzz lint bench docs clean help
 
 help:
 	@sed -n '1,9p' Makefile
@@ -96,6 +97,10 @@ test: lint
 
 test-slow: $(READY)
 	$(BIN)/pytest -m slow
+
+fuzz: $(READY)
+	@bad=0; for source in $$($(BIN)/python -c 'from tests.fuzz.seeds import SEEDS; print(*SEEDS)'); do \
+	$(BIN)/python -m tests.fuzz.fuzz $$source --seconds $(SECONDS) --keep .fuzz || bad=1; done; exit $$bad
 
 bench: $(READY)
 	@for bench in benchmarks/bench_*.py; do echo "== $$bench"; PYTHONPATH=. $(BIN)/python $$bench || exit 1; done

@@ -61,9 +61,10 @@ def run_until_files(code: str, arguments: list[str], *, folder: Path, count: int
 
 
 def tree(root: Path) -> dict[str, bytes]:
-    """Every file below a folder with its bytes; hidden ones left out: the lock, and what is remembered of logs elsewhere."""
+    """Every file below a folder with its bytes; hidden ones left out (the lock, what is remembered of logs elsewhere), and the history,
+    which says when and by which command."""
     return {
         str(path.relative_to(root)): path.read_bytes()
         for path in sorted(root.rglob("*"))
-        if path.is_file() and not path.name.startswith(".")
+        if path.is_file() and not path.name.startswith(".") and "history" not in path.relative_to(root).parts
     }

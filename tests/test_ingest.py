@@ -14,6 +14,7 @@ import zarr
 from tests import synthetic
 from tests.faults import kill_moments, run_until_files, run_until_killed, tree
 from tests.synthetic import task_spec, write_mcap, write_zarr, zarr_task_spec
+from tests.synthetic_bags import write_rosbag1, write_rosbag2
 from vilp_data import shards
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, StoreError, UsageError
@@ -49,6 +50,20 @@ def test_every_encoding_gives_the_frames_and_vectors_that_were_recorded(
     np.testing.assert_allclose(episode.low_dim[:, 0], np.arange(20) / 10, atol=1e-6)
     assert episode.action is not None
     np.testing.assert_allclose(episode.action, [synthetic.action_at(k / 10) for k in range(20)], atol=1e-6)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "bz2"])
+def test_a_ros1_bag_gives_the_episode_of_the_same_messages_in_mcap(tmp_path: Path, compression: str) -> None:
+    log = write_mcap(tmp_path / "run.mcap", image_codec="png", n_frames=6, height=16, width=24)
+    bag = write_rosbag1(tmp_path / "bag.bag", log, compression=compression)  # type: ignore[arg-type]
+    ingest([log.path, bag], tmp_path / "data", task_spec(log))
+    one, other = (EpisodeStore(tmp_path / "data").read(name) for name in ("run", "bag"))
+    assert np.array_equal(one.frames["front"], other.frames["front"])
+    assert np.array_equal(one.low_dim, other.low_dim)
+    assert one.action is not None
+    assert other.action is not None
+    assert np.array_equal(one.action, other.action)
+    assert np.array_equal(one.log_time_ns, other.log_time_ns)
 
 
 def test_a_step_off_in_time_would_be_seen(tmp_path: Path) -> None:
@@ -434,28 +449,27 @@ def test_logs_that_are_passed_over_are_named(tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     folder.mkdir()
     log = write_mcap(folder / "run.mcap")
-    for name in ("old.bag", "bag_0.db3", "bag_1.mcap.zstd", "notes.txt"):
+    for name in ("old.bag.active", "take.mcap.active", "notes.txt"):
         (folder / name).write_bytes(b"x")
     report = ingest([folder], tmp_path / "data", task_spec(log))
-    assert [Path(path).name for path in report.passed_over] == ["bag_0.db3", "bag_1.mcap.zstd", "old.bag"]
+    assert [Path(path).name for path in report.passed_over] == ["old.bag.active", "take.mcap.active"]
     (folder / "run.mcap").unlink()
-    with pytest.raises(UsageError, match="old.bag"):
+    with pytest.raises(UsageError, match="old.bag.active"):
         ingest([folder], tmp_path / "data", task_spec(log))
 
 
-def test_a_split_bag_is_refused_and_keeps_no_other_log_back(tmp_path: Path) -> None:
-    bag = tmp_path / "logs" / "bag"
-    bag.mkdir(parents=True)
-    log = write_mcap(tmp_path / "logs" / "run.mcap")
-    parts = [write_mcap(bag / f"bag_{i}.mcap", jitter_s=0.001, seed=i + 1).path for i in range(2)]
-    listed = "".join(f"    - {part.name}\n" for part in parts)
-    (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{listed}")
+def test_a_split_bag_is_one_episode_and_its_folder_hides_no_other_log(tmp_path: Path) -> None:
+    (tmp_path / "logs" / "bag").mkdir(parents=True)
+    log = write_mcap(tmp_path / "logs" / "bag" / "stray.mcap", height=16, width=24)
+    write_rosbag2(tmp_path / "split", log, parts=3)
+    for file in (tmp_path / "split").iterdir():
+        file.rename(tmp_path / "logs" / "bag" / file.name)
     report = ingest([tmp_path / "logs"], tmp_path / "data", task_spec(log))
-    assert report.written == ["run"]
-    ((name, message),) = report.failed
-    assert name == "bag"
-    assert "split into several files" in message
-    assert ingest(parts, tmp_path / "data", task_spec(log)).written == ["bag_0", "bag_1"]
+    assert (report.written, report.failed) == (["bag", "stray"], [])
+    store = EpisodeStore(tmp_path / "data")
+    bag, stray = (store.read(name) for name in report.written)
+    assert np.array_equal(bag.frames["front"], stray.frames["front"])
+    assert np.array_equal(bag.low_dim, stray.low_dim)
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import urllib.request
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +35,8 @@ from tests.synthetic import (
     write_zarr,
     zarr_task_spec,
 )
+from tests.video_logs import write_video
+from tests.video_packets import GROUP, encode, number_of, numbered_frames
 from vilp_data import shards, viewer, viewer_canvas, viewer_process, viewer_window
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import LogError, StoreError, UsageError
@@ -284,17 +287,33 @@ PNG = encode_image(card_frame(0), "png")
 GOOD = json_image("foxglove.CompressedImage", format="png", data=base64.b64encode(PNG).decode())
 CUT_OFF = json_image("foxglove.CompressedImage", format="png", data=base64.b64encode(PNG[:-30]).decode())
 DEPTH = json_image(
-    "foxglove.RawImage", encoding="16UC1", height=2, width=2, step=4, data=base64.b64encode(bytes(8)).decode()
+    "foxglove.RawImage",
+    encoding="16UC1",
+    height=2,
+    width=2,
+    step=4,
+    data=base64.b64encode(np.array([0, 700, 1500, 65535], "<u2").tobytes()).decode(),
 )
 
 
-def test_a_depth_topic_is_left_out_and_said(tmp_path: Path) -> None:
+def test_a_depth_topic_is_drawn_as_distances_to_the_millimetre(tmp_path: Path) -> None:
     log = write_json_log(tmp_path / "a.mcap", [("/depth", *DEPTH), ("/camera", *GOOD)] * 3)
     drawn = viewer.draw_log(log, tmp_path / "a.rrd")
     assert len(encoded_frames(tmp_path / "a.rrd", "camera")) == 3
-    [note] = drawn.notes
-    assert note.startswith("/depth: 3 messages left out")
-    assert "16UC1" in note
+    assert drawn.notes == ()
+    pngs = [np.array(blob[0], np.uint8) for blob in column(tmp_path / "a.rrd", "depth", "EncodedDepthImage:blob")]
+    assert [cv2.imdecode(png, cv2.IMREAD_UNCHANGED).tolist() for png in pngs] == [[[0, 700], [1500, 65535]]] * 3
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_a_video_topic_is_drawn_as_pictures_at_their_own_times(tmp_path: Path, first: int) -> None:
+    sent = encode(numbered_frames(GROUP + 8), "h264")[first:]
+    shown = [replace(packet, shows=packet.shows - first) for packet in sent]
+    drawn = viewer.draw_log(write_video(tmp_path / "a.mcap", shown, "h264"), tmp_path / "a.rrd")
+    frames = encoded_frames(tmp_path / "a.rrd", "camera/video")
+    assert [number_of(frame) for frame in frames] == list(range(GROUP if first else 0, GROUP + 8))
+    assert len(drawn.notes) == (1 if first else 0)
+    assert all("before the first keyframe" in note for note in drawn.notes)
 
 
 def test_damaged_images_among_good_ones_are_skipped_and_counted(tmp_path: Path) -> None:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from pathlib import Path
 
 import numpy as np
 
-from vilp_data import align, decode, geometry
-from vilp_data.errors import AlignError, DecodeError, LogError, SpecError, UsageError, nearest
-from vilp_data.spec import ActionSpec, TaskSpec, TopicSpec, VectorSpec, ViewSpec
-from vilp_data.types import F32, F64, I32, I64, U8, Bool, Episode, LogEpisode, LogReader, Message, Outcome
-
-DAMAGED_SHARE = 0.5
-"""More damaged images than this among those that steps use, and the episode is refused: that is no glitch."""
+from vilp_data import align
+from vilp_data.errors import AlignError, LogError, SpecError, nearest
+from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
+from vilp_data.transforms import ALWAYS_NS
+from vilp_data.types import F32, F64, I64, Bool, Episode, LogEpisode, LogReader, outcome_of
+from vilp_data.vector_tracks import Tracks, VectorTracks, age_name, in_time, moves_frames, stamp_ns
+from vilp_data.video_start import packets_before
+from vilp_data.view_frames import Seen, Ticks, ViewFrames
 
 HELD_LONG_S = 1.0
 """A command in force for longer than this is worth a word: its publisher may have died."""
@@ -24,39 +26,39 @@ FAR_S = 60.0
 
 
 @dataclass(frozen=True)
-class Track:
-    """One topic's messages in order of its clock.
+class Collected:
+    """What was read of a demonstration: the stamps of each view's images, int64 [M] in order, its frames, and each part's vectors."""
 
-    stamps_ns  int64 [M]
-    images     for a camera: each image, still compressed, or uint8 [H,W,3] at its stored size
-    vectors    for other topics: "low_dim.<part>", "action.<part>" or "state" -> float64 [M,D]
-    """
-
-    stamps_ns: I64
-    images: Sequence[Message | U8]
-    vectors: Mapping[str, F64]
+    stamps_ns: Mapping[str, I64]
+    frames: Mapping[str, ViewFrames]
+    tracks: Tracks
 
 
-Tracks: TypeAlias = Mapping[str, Track]
-VectorReader: TypeAlias = Callable[[Message], F64]
-
-
-def assemble_episode(log: LogReader, demonstration: LogEpisode, spec: TaskSpec, *, episode_id: str) -> Episode:
-    """One demonstration on one control clock.
+def assemble_episode(
+    log: LogReader, demonstration: LogEpisode, spec: TaskSpec, *, episode_id: str, scratch: Path | None = None
+) -> Episode:
+    """One demonstration on one control clock. What of its frames does not fit in memory lies in an unnamed file in `scratch`, and is
+    mapped.
 
     Raises LogError, DecodeError, AlignError or SpecError, each saying what in the log or the spec is wrong."""
     where = f"{log.path}, {demonstration.name}"
-    tracks = collect(log, demonstration, spec, available_topics(log, spec))
-    view_stamps = {view: tracks[view_spec.topic].stamps_ns for view, view_spec in spec.views.items()}
-    rate_hz = spec.rate_hz or min(align.median_rate_hz(stamps) for stamps in view_stamps.values())
-    refuse_short_stride(spec, view_stamps, rate_hz)
-    ticks = align.control_ticks(view_stamps, rate_hz)
+    topics, guess = available_topics(log, spec), Ticks(spec.rate_hz, len(spec.views))
+    collected = collect(log, demonstration, spec, topics, guess, scratch=scratch)
+    rate_hz = spec.rate_hz or min(align.median_rate_hz(stamps) for stamps in collected.stamps_ns.values())
+    refuse_short_stride(spec, collected.stamps_ns, rate_hz)
+    ticks = align.control_ticks(collected.stamps_ns or _vector_stamps(collected.tracks), rate_hz)
+    if (
+        spec.views and guess.start_ns != ticks[0] and guess.rate_hz is not None
+    ):  # a first image came late: some were left out that steps see
+        known = Ticks(rate_hz, len(spec.views), start_ns=int(ticks[0]))
+        collected = collect(log, demonstration, spec, topics, known, scratch=scratch)
     if len(ticks) < 2:
         raise AlignError("an episode of one step holds no motion to learn", where=where, remedy="leave this log out")
 
-    views = {view: _observe_images(tracks[table.topic], ticks, table) for view, table in spec.views.items()}
+    tracks = collected.tracks
+    views = {view: collected.frames[view].observe(ticks) for view in spec.views}
     low_dim = {name: _observe_vector(table, f"low_dim.{name}", tracks, ticks) for name, table in spec.low_dim.items()}
-    state = _observe_vector(spec.state, "state", tracks, ticks) if spec.state and spec.state.topic in tracks else None
+    state = _observe_vector(spec.state, "state", tracks, ticks) if spec.state and "state" in tracks else None
     action = _actions(spec, tracks, ticks, low_dim, rate_hz)
 
     valid = {f"view {view}": images.valid for view, images in views.items()}
@@ -72,8 +74,8 @@ def assemble_episode(log: LogReader, demonstration: LogEpisode, spec: TaskSpec, 
             remedy="`vilp-data inspect` shows the clocks and gaps",
         )
     ages = {spec.views[view].topic: images.age_s for view, images in views.items()}
-    ages |= {spec.low_dim[name].topic: part.age_s for name, part in low_dim.items()}
-    ages |= {topic: part.age_s for name, part in action.items() if (topic := spec.action[name].topic) is not None}
+    ages |= {age_name(spec.low_dim[name]): part.age_s for name, part in low_dim.items()}
+    ages |= {age_name(spec.action[name]): part.age_s for name, part in action.items() if spec.action[name].topic}
     return Episode(
         id=episode_id,
         frames={view: images.frames for view, images in views.items()},
@@ -89,12 +91,6 @@ def assemble_episode(log: LogReader, demonstration: LogEpisode, spec: TaskSpec, 
         outcome=outcome_of(demonstration.tags),
         findings=findings,
     )
-
-
-def outcome_of(tags: Mapping[str, str]) -> Outcome:
-    """What the log says of itself: its `success` tag, "true" or "false"."""
-    outcomes: dict[str, Outcome] = {"true": "success", "false": "failure"}
-    return outcomes.get(tags.get("success", "").lower(), "unknown")
 
 
 # --- reading ------------------------------------------------------------------------------------------------------------
@@ -114,91 +110,63 @@ def available_topics(log: LogReader, spec: TaskSpec) -> list[str]:
     return [topic for topic in spec.topics() if topic in have]
 
 
-def collect(log: LogReader, demonstration: LogEpisode, spec: TaskSpec, topics: Sequence[str]) -> dict[str, Track]:
-    """Read a demonstration's messages once, each topic in order of its own clock.
+def collect(
+    log: LogReader,
+    demonstration: LogEpisode,
+    spec: TaskSpec,
+    topics: Sequence[str],
+    ticks: Ticks,
+    *,
+    scratch: Path | None = None,
+) -> Collected:
+    """Read a demonstration's messages once: each part's in order of its topic's clock, and each view's images as far as steps see them.
+    Static transforms are read from all of the log, for they hold at all times.
 
-    Vectors are read as they come. Compressed images wait as bytes until it is known which of them steps use; raw ones are
-    resized as they come, so that an hour of raw video does not have to fit in memory."""
-    views = {view.topic: view for view in spec.views.values()}
-    clocks, readers = spec.clocks(), _vector_readers(spec)
-    stamps: dict[str, list[int]] = {topic: [] for topic in topics}
-    images: dict[str, list[Message | U8]] = {topic: [] for topic in topics}
-    rows: dict[str, dict[str, list[F64]]] = {topic: {part: [] for part in readers.get(topic, {})} for topic in topics}
+    Vectors are read and images decoded as they come, so that the log does not have to fit in memory."""
+    views = {
+        table.topic: ViewFrames(view, table, ticks, scratch=scratch)
+        for view, table in sorted(spec.views.items())
+        if table.topic in topics
+    }
+    for topic, view in views.items():
+        view.warm_up(packets_before(log, topic, demonstration))
+    clocks, frame_topics = spec.clocks(), moves_frames(spec)
+    stamps = {topic: array("q") for topic in views}
+    vectors = VectorTracks(spec, topics)
+    if static := vectors.static_topics & {topic.name for topic in log.topics() if topic.message_count != 0}:
+        for message in log.messages(static):
+            vectors.add_static(message)
     for message in log.messages(topics, start_ns=demonstration.start_ns, end_ns=demonstration.end_ns):
         topic = message.topic
-        stamps[topic].append(stamp_ns(message, clocks[topic]))
-        if topic in views:
-            waits = message.schema in decode.COMPRESSED_IMAGES
-            images[topic].append(message if waits else stored_image(message, views[topic]))
-        for part, read in readers.get(topic, {}).items():
-            rows[topic][part].append(read(message))
-    for topic in topics:
+        stamp = None if topic in frame_topics else stamp_ns(message, clocks[topic])
+        if topic in views and stamp is not None:
+            stamps[topic].append(stamp)
+            views[topic].add(message, stamp)
+        vectors.add(message, stamp)
+    where = f"{log.path}, {demonstration.name}"
+    in_order: dict[str, I64] = {}
+    for topic, view in views.items():
         if not stamps[topic]:
-            where, remedy = (
-                f"{log.path}, {demonstration.name}",
-                "leave this log out, or take the topic out of the task TOML",
-            )
+            remedy = "leave this log out, or take the topic out of the task TOML"
             raise LogError(f"no message on topic {topic!r}", where=where, remedy=remedy)
-    return {topic: _track(topic, stamps[topic], images[topic], rows[topic]) for topic in topics}
+        stamps_ns, order = in_time(topic, stamps[topic])
+        in_order[view.view] = stamps_ns[order]
+    return Collected(in_order, {view.view: view for view in views.values()}, vectors.tracks(where))
 
 
-def stamp_ns(message: Message, spec: TopicSpec | ActionSpec) -> int:
-    """The message's time by the clock that the spec names, offset included."""
-    if spec.clock == "header":
-        stamp = decode.header_time_ns(message)
-        if stamp is None:
-            raise DecodeError(
-                "its messages carry no stamp of their own",
-                where=message.topic,
-                found=message.schema,
-                remedy='set clock = "log" for this topic',
-            )
-    else:
-        stamp = message.log_time_ns if spec.clock == "log" else message.publish_time_ns
-    return stamp + round(spec.offset_s * 1e9)
-
-
-def stored_image(message: Message, view: ViewSpec) -> U8:
-    """The image as it is stored: uint8 [H,W,3] at the view's size."""
-    try:
-        return geometry.fit_image(decode.decode_image(message), view.height, view.width, view.fit)
-    except UsageError as error:
-        raise SpecError(error.what, where=message.topic, remedy=error.remedy) from error
-
-
-def _vector_readers(spec: TaskSpec) -> dict[str, dict[str, VectorReader]]:
-    """topic -> part -> how to read that part's vector from a message."""
-    tables: list[tuple[str, VectorSpec | ActionSpec]] = [
-        (f"low_dim.{name}", table) for name, table in spec.low_dim.items()
-    ]
-    tables += [(f"action.{name}", table) for name, table in spec.action.items()]
-    tables += [("state", spec.state)] if spec.state else []
-    readers: dict[str, dict[str, VectorReader]] = {}
-    for part, table in tables:
-        if table.topic is not None:
-            readers.setdefault(table.topic, {})[part] = decode.compile_fields(table.fields, table.names)
-    return readers
-
-
-def _track(topic: str, stamps: list[int], images: list[Message | U8], rows: Mapping[str, list[F64]]) -> Track:
-    stamps_ns = np.array(stamps, np.int64)
-    if len(stamps) > 1 and stamps_ns.min() == stamps_ns.max():
-        found = f"{len(stamps)} messages, all stamped {stamps[0]} ns"
-        raise AlignError("its stamps tell no time", where=topic, found=found, remedy='set clock = "log" for this topic')
-    order = align.order_of(stamps_ns, topic=topic)
-    vectors = {part: _stacked(topic, values)[order] for part, values in rows.items()}
-    return Track(stamps_ns[order], [images[i] for i in order] if images else [], vectors)
-
-
-def _stacked(topic: str, rows: Sequence[F64]) -> F64:
-    if len(lengths := {len(row) for row in rows}) > 1:
-        raise DecodeError(
-            "vectors of different lengths",
-            where=topic,
-            found=f"lengths {sorted(lengths)}",
-            remedy="say which fields to read, or which joints by `names`",
+def _vector_stamps(tracks: Tracks) -> dict[str, I64]:
+    """What a task without views takes its steps from: the stamps of its low_dim parts."""
+    stamps = {
+        part: track.stamps_ns[np.isfinite(track.values).all(axis=1) & (track.stamps_ns > ALWAYS_NS)]
+        for part, track in tracks.items()
+        if part.startswith("low_dim.")
+    }
+    if short := [part for part, times in stamps.items() if not len(times)]:
+        found = "nothing that ever changes, or no number"
+        raise AlignError(
+            f"{short[0]} tells no time", found=found, remedy="give the task a view, or another low_dim part"
         )
-    return np.asarray(rows, np.float64).reshape(len(rows), -1)
+    return stamps
 
 
 # --- one value a step ---------------------------------------------------------------------------------------------------
@@ -213,70 +181,24 @@ class _Vector:
     age_s: F32
 
 
-@dataclass(frozen=True)
-class _Images:
-    """A view's images that steps use, each once, uint8 [n,H,W,3]; which of them each step sees, int32 [F]; where it may be used
-    and its age, bool and float32 [F]; how many images were damaged and passed over."""
-
-    frames: U8
-    source_index: I32
-    valid: Bool
-    age_s: F32
-    damaged: int
-
-
-def _observe_images(track: Track, ticks: I64, view: ViewSpec) -> _Images:
-    """What the view shows at each tick. A damaged image is one that never came: the step sees the one before it."""
-    kept = np.arange(len(track.stamps_ns))
-    decoded: dict[int, U8] = {}
-    while True:
-        observed = align.observe(track.stamps_ns[kept], ticks, stale_after_s=view.stale_after_s)
-        used, source_index = np.unique(np.maximum(observed.index, 0), return_inverse=True)
-        damaged, error = _decode_missing(track, kept[used], view, decoded)
-        if error is None:
-            break
-        if len(damaged) > DAMAGED_SHARE * len(used):
-            raise error
-        kept = kept[~np.isin(kept, damaged)]
-    frames = np.stack([decoded[int(i)] for i in kept[used]])
-    passed_over = len(track.stamps_ns) - len(kept)
-    return _Images(frames, source_index.astype(np.int32), observed.valid, observed.age_s, passed_over)
-
-
-def _decode_missing(
-    track: Track, wanted: align.Index, view: ViewSpec, decoded: dict[int, U8]
-) -> tuple[list[int], DecodeError | None]:
-    """Decode what is not decoded yet; the indices of damaged images, and the first one's error."""
-    damaged: list[int] = []
-    first: DecodeError | None = None
-    for i in map(int, wanted):
-        image = track.images[i]
-        if i in decoded:
-            continue
-        if not isinstance(image, Message):
-            decoded[i] = image
-            continue
-        try:
-            decoded[i] = stored_image(image, view)
-        except DecodeError as error:
-            damaged.append(i)
-            first = first or error
-    return damaged, first
-
-
 def _observe_vector(spec: VectorSpec, part: str, tracks: Tracks, ticks: I64) -> _Vector:
-    track = tracks[spec.topic]
-    observed = align.observe(track.stamps_ns, ticks, stale_after_s=spec.stale_after_s)
-    values = track.vectors[part][np.maximum(observed.index, 0)]
+    track = tracks[part]
+    stale_after_s = (
+        spec.stale_after_s if spec.from_frame is None else np.inf
+    )  # transforms that are too old are no numbers
+    observed = align.observe(track.stamps_ns, ticks, stale_after_s=stale_after_s)
+    latest = np.maximum(observed.index, 0)
+    values = track.values[latest]
     values[observed.index < 0] = np.nan
-    return _Vector(values, observed.valid & _finite(values), observed.age_s)
+    age_s = np.where(track.stamps_ns[latest] == ALWAYS_NS, np.float32(0), observed.age_s)
+    return _Vector(values, observed.valid & _finite(values), age_s)
 
 
 def _actions(
     spec: TaskSpec, tracks: Tracks, ticks: I64, low_dim: Mapping[str, _Vector], rate_hz: float
 ) -> dict[str, _Vector]:
     """The action's parts at every tick; empty for a log without commands, which may still be watched."""
-    if any(part.topic is not None and part.topic not in tracks for part in spec.action.values()):
+    if any(part.topic is not None and f"action.{name}" not in tracks for name, part in spec.action.items()):
         return {}
     period_ns = round(1e9 / rate_hz)
     return {
@@ -292,7 +214,7 @@ def _action_part(
         source = low_dim[str(part.from_)]
         ahead = np.minimum(np.arange(len(ticks)) + part.shift, len(ticks) - 1)
         return _Vector(source.values[ahead], source.valid[ahead], np.zeros(len(ticks), np.float32))
-    stamps, values = tracks[part.topic].stamps_ns, tracks[part.topic].vectors[name]
+    stamps, values = tracks[name].stamps_ns, tracks[name].values
     _refuse_foreign_commands(part, stamps, ticks, period_ns)
     if part.kind == "absolute":
         index = align.command_in_force(stamps, ticks, period_ns=period_ns)
@@ -354,7 +276,7 @@ def refuse_short_stride(spec: TaskSpec, view_stamps: Mapping[str, I64], rate_hz:
             )
 
 
-def _findings(valid: Mapping[str, Bool], views: Mapping[str, _Images], action: Mapping[str, _Vector]) -> Iterator[str]:
+def _findings(valid: Mapping[str, Bool], views: Mapping[str, Seen], action: Mapping[str, _Vector]) -> Iterator[str]:
     """Plain sentences about what was masked, repeated, damaged or held, with counts."""
     for name, usable in valid.items():
         if masked := int(np.count_nonzero(~usable)):
@@ -362,7 +284,10 @@ def _findings(valid: Mapping[str, Bool], views: Mapping[str, _Images], action: M
             yield f"{name}: missing, stale or not finite at {where}; those steps are masked"
     for view, images in views.items():
         if images.damaged:
-            yield f"view {view}: {images.damaged} damaged images passed over"
+            early = (
+                f", {images.before_keyframe} of them video before its first keyframe" if images.before_keyframe else ""
+            )
+            yield f"view {view}: {images.damaged} damaged images passed over{early}"
         repeated, n_steps = int(np.count_nonzero(np.diff(images.source_index) == 0)), len(images.source_index)
         if repeated:
             advice = (

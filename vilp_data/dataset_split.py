@@ -7,17 +7,19 @@ none is judged by them.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from vilp_data import shards
+from vilp_data import history, shards
 from vilp_data.duplicates import thumbnails
 from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError
+from vilp_data.removed import read_removed
 from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
-from vilp_data.split_lock import Side, SplitLock
+from vilp_data.split_lock import Side, SplitLock, assignment_hash
 from vilp_data.types import is_rollout
 
 
@@ -88,8 +90,18 @@ def update_split(
         data = lock.to_json()
         path = lock_path(root)
         if not path.is_file() or path.read_bytes() != data:
-            shards.write_atomic(path, data)
+            staged = history.stage(root, path.name)
+            shards.write_atomic(staged, data)
+            note = _in_words(lock, previous, redraw=redraw)
+            history.perform(root, "split", history.Changes(staged={path.name: staged}, removed=[]), note)
     return lock
+
+
+def _in_words(lock: SplitLock, previous: SplitLock | None, *, redraw: bool) -> str:
+    sides = f"{len(lock.ids('train'))} training, {len(lock.ids('val'))} validation"
+    if previous is None or redraw:
+        return f"drawn{' anew' if previous else ''}: {sides}"
+    return f"{len(lock.assignment.keys() - previous.assignment.keys())} episodes placed: {sides}"
 
 
 def check_dataset_split(root: Path) -> list[str]:
@@ -97,7 +109,13 @@ def check_dataset_split(root: Path) -> list[str]:
     lock = find_split(root)
     if lock is None:
         return ["no split yet: run `vilp-data split`"]
-    return check_split(lock, list(split_episodes(EpisodeStore(root), lock.group_by, lock.strata)))
+    here = list(split_episodes(EpisodeStore(root), lock.group_by, lock.strata))
+    # What was removed on purpose is no finding: it keeps its side, should it come back.
+    away = read_removed(root).keys() - {episode.id for episode in here}
+    if away and lock.is_intact:
+        kept = {id: side for id, side in lock.assignment.items() if id not in away}
+        lock = replace(lock, assignment=kept, hash=assignment_hash(kept))
+    return check_split(lock, here)
 
 
 def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str, ...]) -> Iterator[SplitEpisode]:
@@ -115,16 +133,16 @@ def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str,
                 )
         yield SplitEpisode(
             id=entry.id,
-            content_hash=entry.content_sha256,
+            content_hash=entry.ingest_content,
             group=entry.tags[group_by] if group_by else None,
             strata=tuple(entry.tags[tag] for tag in strata),
             thumbnails=_thumbnails(store, entry),
         )
 
 
-def _thumbnails(store: EpisodeStore, entry: EpisodeEntry) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """The first, middle and last frame of every view, small and grey: float32 [3V,8,8]."""
+def _thumbnails(store: EpisodeStore, entry: EpisodeEntry) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]] | None:
+    """The first, middle and last frame of every view, small and grey: float32 [3V,8,8]; None for an episode without views."""
     rows = []
     for view in sorted(entry.frames_sha256):
         rows.append(thumbnails(open_frames(store, entry, view)))
-    return np.concatenate(rows)
+    return np.concatenate(rows) if rows else None

@@ -47,6 +47,8 @@ def header_time_ns(message: Message) -> int | None:
             and not (hasattr(stamp, "seconds") and body.HasField("timestamp"))
         ):
             return None  # protobuf: the field is unset, or a plain number
+    if stamp is None:
+        return None
     seconds = first_member(stamp, ("sec", "seconds"))
     nanoseconds = first_member(stamp, ("nanosec", "nsec", "nanos"))
     if not isinstance(seconds, int) or not isinstance(nanoseconds, int):

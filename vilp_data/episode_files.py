@@ -45,12 +45,13 @@ def open_steps(store: EpisodeStore, entry: EpisodeEntry, views: Iterable[str] = 
 
 
 def open_frames(store: EpisodeStore, entry: EpisodeEntry, view: str) -> U8:
-    """The mapped frames uint8 [n,H,W,3] of one view. Raises StoreError where they are missing, or not those that the episode
-    was committed with."""
+    """The mapped frames uint8 [n,H,W,C] of one view; of a trimmed episode those that are left. Raises StoreError where they are
+    missing, or not those that the episode was committed with."""
     path = store.frames_path(view, entry.id)
     shard = shards.open_shard(path)
     frames = shard.arrays["frames"]
-    if shard.metadata.get("frames_sha256") != entry.frames_sha256[view] or len(frames) != entry.n_frames[view]:
-        found = f"{len(frames)} frames; the episode has {entry.n_frames[view]}"
+    stored, first = entry.stored_frames(view), entry.first_frame(view)
+    if shard.metadata.get("frames_sha256") != entry.frames_sha256[view] or len(frames) != stored:
+        found = f"{len(frames)} frames; the episode has {stored}"
         raise StoreError("not the frames this episode was committed with", where=path, found=found, remedy=INGEST_AGAIN)
-    return cast(U8, frames)
+    return cast(U8, frames[first : first + entry.n_frames[view]])

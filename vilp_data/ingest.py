@@ -13,9 +13,11 @@ from vilp_data.assemble import assemble_episode
 from vilp_data.engine import map_unordered
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import AlignError, DecodeError, LogError, SpecError, UsageError, VilpDataError
+from vilp_data.history import Recording, recording
 from vilp_data.ingest_plan import Plan, Planned, make_plan
 from vilp_data.log_files import find_logs
 from vilp_data.log_hashes import HashCache
+from vilp_data.removed import read_removed, removed_bytes, removed_path
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import Episode, LogReader
@@ -29,12 +31,14 @@ RATE_TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class IngestJob:
-    """Some demonstrations of one log, for one worker. `rate_hz`: that of the dataset's other episodes, None for the first."""
+    """Some demonstrations of one log, for one worker. `rate_hz`: that of the dataset's other episodes, None for the first. `hold`: where
+    files are kept that are replaced."""
 
     root: Path
     spec: TaskSpec
     episodes: tuple[Planned, ...]
     rate_hz: float | None
+    hold: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class IngestReport:
 
     written, fresh, left_out  ids of episodes: stored now, there already, and not wanted since they failed
     rollouts     ids of a policy's own episodes, not wanted unless asked for
+    removed      ids of episodes that were removed on purpose, not wanted unless asked for
     replaced     those of `written` that took the place of an episode with other content, since their log changed
     failed       (id, or name of a log) and why nothing came of it
     findings     id -> what was masked or repeated in it
@@ -63,6 +68,7 @@ class IngestReport:
     fresh: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     rollouts: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
     failed: list[tuple[str, str]] = field(default_factory=list)
     findings: dict[str, tuple[str, ...]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -71,49 +77,73 @@ class IngestReport:
 
 def ingest_logs(
     logs: Sequence[Path], root: Path, spec: TaskSpec, *, workers: int, include_failures: bool = False, with_rollouts: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    again: bool = False, progress: Callable[[int, int], None] | None = None,
 ) -> IngestReport:  # fmt: skip
     """Ingest every demonstration of `logs` into the dataset at `root`. What is there under today's key is left alone; what cannot
     be read is reported and keeps nothing else back. `progress(done, total)` counts demonstrations. Which stored episode a changed
-    log belongs to is said in `ingest_plan`.
+    log belongs to is said in `ingest_plan`. What was removed on purpose stays out, unless it is wanted `again`. It is one operation
+    of the dataset's history, where it changes anything.
 
     Raises UsageError where no log is found at a path, or the dataset is of another task or spec, BusyError where another process
     writes it."""
     found = find_logs(logs)
     store = EpisodeStore(root)
-    with shards.writer_lock(root):
+    with shards.writer_lock(root), recording(root, "ingest") as work:
         cache = HashCache(root)
-        plan = make_plan(found.logs, store, spec, cache, include_failures=include_failures, with_rollouts=with_rollouts)
+        plan = make_plan(
+            found.logs, store, spec, cache, include_failures=include_failures, with_rollouts=with_rollouts, again=again
+        )
         cache.save()
         report = IngestReport(
-            fresh=plan.fresh, left_out=plan.left_out, rollouts=plan.rollouts, failed=plan.failed, notes=plan.notes,
-            passed_over=[str(path) for path in found.passed_over],
+            fresh=plan.fresh, left_out=plan.left_out, rollouts=plan.rollouts, removed=plan.removed, failed=plan.failed,
+            notes=plan.notes, passed_over=[str(path) for path in found.passed_over],
         )  # fmt: skip
         if plan.fresh:
-            store.write_spec(spec)
+            _write_spec(store, spec, work)
         if plan.todo:
+            work.begin()
             store.remove_index()
-        with closing(_ingest(plan, root, spec, workers)) as results:  # so that no worker outlives the lock
+        with closing(_ingest(plan, root, spec, workers, work.hold)) as results:  # so that no worker outlives the lock
             for done, (planned, result) in enumerate(results, start=1):
                 if isinstance(result, VilpDataError):
                     report.failed.append((planned.id, str(result)))
                 else:
                     if not report.written:
-                        store.write_spec(spec)  # not before: a spec that fits no log must not become the dataset's
+                        _write_spec(
+                            store, spec, work
+                        )  # not before: a spec that fits no log must not become the dataset's
                     report.written.append(planned.id)
                     report.findings |= {planned.id: result.findings} if result.findings else {}
                 if progress is not None:
                     progress(done, len(plan.todo))
+        _take_off_removed(root, [*report.written, *report.fresh], work)
         if not store.index_path.is_file():
             store.write_index()
-    report.written.sort()
-    report.failed.sort()
-    report.replaced = sorted(plan.replaced.intersection(report.written))
+        report.written.sort()
+        report.failed.sort()
+        report.replaced = sorted(plan.replaced.intersection(report.written))
     return report
 
 
+def _write_spec(store: EpisodeStore, spec: TaskSpec, work: Recording) -> None:
+    if not store.has_spec(spec):
+        work.begin()
+        work.keep("dataset.json")
+        store.write_spec(spec)
+
+
+def _take_off_removed(root: Path, stored: Sequence[str], work: Recording) -> None:
+    """What is stored is not removed any more, having been wanted again."""
+    removed = read_removed(root)
+    left = {id: episode for id, episode in removed.items() if id not in stored}
+    if len(left) < len(removed):
+        work.begin()
+        work.keep(removed_path(root).name)
+        shards.write_atomic(removed_path(root), removed_bytes(left))
+
+
 def _ingest(
-    plan: Plan, root: Path, spec: TaskSpec, workers: int
+    plan: Plan, root: Path, spec: TaskSpec, workers: int, hold: Path | None
 ) -> Generator[tuple[Planned, Ingested | VilpDataError], None, None]:
     """Do what is to do. Where the spec states no rate, the first episode by id sets it for the dataset, and so goes before the
     others: which are refused must not depend on the order in which workers end."""
@@ -121,14 +151,14 @@ def _ingest(
     while spec.rate_hz is None and rate_hz is None and todo:
         first = min(todo, key=lambda planned: planned.id)
         todo.remove(first)
-        (result,) = ingest_job(IngestJob(root, spec, (first,), None))
+        (result,) = ingest_job(IngestJob(root, spec, (first,), None, hold))
         rate_hz = None if isinstance(result, VilpDataError) else result.rate_hz
         yield first, result
     jobs: list[IngestJob] = []
     for _, group in groupby(todo, key=lambda planned: planned.source.log):
         episodes = list(group)
         parts = [tuple(episodes[i : i + EPISODES_PER_JOB]) for i in range(0, len(episodes), EPISODES_PER_JOB)]
-        jobs += [IngestJob(root, spec, part, rate_hz) for part in parts]
+        jobs += [IngestJob(root, spec, part, rate_hz, hold) for part in parts]
     with closing(map_unordered(ingest_job, jobs, workers=workers if len(jobs) > 1 else 1)) as finished:
         for job, results in finished:
             yield from zip(job.episodes, results, strict=True)
@@ -146,7 +176,7 @@ def ingest_job(job: IngestJob) -> list[Ingested | VilpDataError]:
 def _ingest_one(log: LogReader, planned: Planned, job: IngestJob) -> Ingested | VilpDataError:
     source = planned.source
     try:
-        episode = assemble_episode(log, source.demonstration, job.spec, episode_id=planned.id)
+        episode = assemble_episode(log, source.demonstration, job.spec, episode_id=planned.id, scratch=job.root)
         _refuse_another_rate(episode, job.rate_hz, source.log)
     except (LogError, DecodeError, AlignError, SpecError) as error:
         return error
@@ -157,7 +187,10 @@ def _ingest_one(log: LogReader, planned: Planned, job: IngestJob) -> Ingested | 
         )
     fields = job.spec.ingest_fields()
     origin = Origin(source.log.name, source.sha256, source.demonstration.name, planned.key, fields)
-    EpisodeStore(job.root).write(episode, origin)
+    try:
+        EpisodeStore(job.root).write(episode, origin, edits=planned.edits, hold=job.hold)
+    except UsageError as error:  # what was trimmed before leaves too little on today's clock
+        return error
     return Ingested(episode.rate_hz, episode.findings)
 
 

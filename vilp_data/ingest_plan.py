@@ -6,6 +6,7 @@ holds many. The same bytes are the same episode, whatever the log is called now.
 - A log of many demonstrations whose name is known, and in which at least half of the episodes stored from that name are found
   unchanged, is the same log grown or edited: demonstrations of a new name are added, those of a known name replace their episode,
   unless another log of this call holds that episode. `Plan.replaced` names them.
+- What was removed on purpose (`removed`) is known by its bytes too, and stays out.
 - Anything else is new. Where its name is taken it gets the first digits of its hash as a suffix: logs of several days may all be
   called run.mcap, and none may overwrite another. `Plan.notes` says so.
 """
@@ -14,17 +15,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
-from vilp_data.assemble import outcome_of
+from vilp_data.cut_log import cut_log
+from vilp_data.demonstrations import CUT_TAG
+from vilp_data.edits import Edits, edits_of
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import LogError, UsageError
-from vilp_data.keys import episode_key, first_difference
+from vilp_data.errors import DecodeError, LogError, SpecError, UsageError
+from vilp_data.keys import digest, episode_key, first_difference
 from vilp_data.log_hashes import HashCache
+from vilp_data.removed import Removed, read_removed
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
-from vilp_data.types import LogEpisode, is_rollout
+from vilp_data.types import LogEpisode, is_rollout, outcome_of
 
 
 @dataclass(frozen=True)
@@ -39,23 +44,25 @@ class Source:
 
 @dataclass(frozen=True)
 class Planned:
-    """A demonstration that is to be ingested, as the episode `id`."""
+    """A demonstration that is to be ingested, as the episode `id`; `edits` are what people did to it since its last ingest."""
 
     id: str
     source: Source
     key: str
+    edits: Edits | None = None
 
 
 @dataclass
 class Plan:
-    """`todo` in order of logs; ids of what is fresh, left out as a failure, a policy's `rollouts` left out, `replaced` by what is to
-    do; what could not be read (name, why); sentences about names that are not what they were; `rate_hz` of the episodes that
-    stay, None where none do."""
+    """`todo` in order of logs; ids of what is fresh, left out as a failure, a policy's `rollouts` left out, `removed` on purpose before,
+    `replaced` by what is to do; what could not be read (name, why); sentences about names that are not what they were; `rate_hz` of
+    the episodes that stay, None where none do."""
 
     todo: list[Planned] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     rollouts: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
     replaced: set[str] = field(default_factory=set)
     failed: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -70,32 +77,38 @@ def make_plan(
     *,
     include_failures: bool,
     with_rollouts: bool,
+    again: bool = False,
 ) -> Plan:
-    """Compare logs with the store. Raises UsageError where the dataset is of another task, or where episodes ingested by another
-    spec would stay in it."""
+    """Compare logs with the store. What was removed on purpose stays out, unless it is wanted `again`. Raises UsageError where the
+    dataset is of another task, or where episodes ingested by another spec would stay in it."""
     plan = Plan()
     fields = spec.ingest_fields()
     present = {entry.id: entry for entry in store.index()}
     _refuse_another_task(store, spec, present)
-    sources = read_sources(logs, spec, cache, plan)
-    for source, episode_id in identify(sources, list(present.values()), plan):
+    sources, removed = read_sources(logs, spec, cache, plan), read_removed(store.root)
+    for source, episode_id in identify(sources, list(present.values()), plan, removed):
         entry = present.get(episode_id)
+        if entry is None and episode_id in removed and not again:
+            plan.removed.append(episode_id)
+            continue
+        edits = _edits_to_keep(entry, source, plan)
         name = source.demonstration.name
         if entry is not None and entry.source_sha256 == source.sha256:
             name = entry.source_episode  # a store past its thousandth demonstration counts them with one more digit
         key = episode_key(source_sha256=source.sha256, source_episode=name, ingest_fields=fields)
-        if entry is not None and entry.key == key and store.frames_fit(entry):
+        if entry is not None and entry.ingest_key == key and store.frames_fit(entry):
             plan.fresh.append(episode_id)
         elif is_rollout(source.demonstration.tags) and not with_rollouts:
             plan.rollouts.append(episode_id)
-        elif outcome_of(source.demonstration.tags) == "failure" and not include_failures:
+        elif not include_failures and _failed(source, edits):
             plan.left_out.append(episode_id)
         else:
             key = episode_key(
                 source_sha256=source.sha256, source_episode=source.demonstration.name, ingest_fields=fields
             )
-            plan.todo.append(Planned(episode_id, source, key))
+            plan.todo.append(Planned(episode_id, source, key, edits))
     settled = {*plan.fresh, *(planned.id for planned in plan.todo)}
+    plan.notes += _no_longer_cut(sources, [entry for entry in present.values() if entry.id not in settled], spec)
     _refuse_another_spec(store, [entry for entry in present.values() if entry.id not in settled], fields)
     plan.replaced &= {planned.id for planned in plan.todo}
     plan.rate_hz = next((entry.rate_hz for entry in present.values() if entry.ingest == fields), None)
@@ -108,17 +121,22 @@ def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, plan: P
     for path in logs:
         try:
             with open_log(path, array_rate_hz=spec.rate_hz or 10.0) as log:
-                demonstrations = log.episodes()
-                hashes = cache.of_log(log, path, demonstrations)
-        except LogError as error:
+                natives = log.episodes()
+                hashes = cache.of_log(log, path, natives)
+                cuts = cut_log(log, spec, path, partial(cache.of_look, path))
+        except (LogError, DecodeError, SpecError) as error:
             plan.failed.append((path.name, str(error)))
             continue
-        if not demonstrations:
+        plan.notes += cuts.notes
+        if not natives:
             empty = LogError("the log holds no message", where=path, remedy="leave it out")
             plan.failed.append((path.name, str(empty)))
-        for demonstration in demonstrations:
-            sha256 = hashes[demonstration.name]
-            source = Source(path, demonstration, sha256, alone=len(demonstrations) == 1)
+        is_cut = spec.episodes.kind != "file"
+        for demonstration in cuts.demonstrations:
+            sha256 = hashes[cuts.native[demonstration.name]]
+            if is_cut:  # known by its own range of the log's bytes
+                sha256 = digest({"log": sha256, "start_ns": demonstration.start_ns, "end_ns": demonstration.end_ns})
+            source = Source(path, demonstration, sha256, alone=len(natives) == 1 and not is_cut)
             first = sources.setdefault(sha256, source)
             if first is not source:
                 copied = "" if first.alone else f", {first.demonstration.name}"
@@ -126,11 +144,15 @@ def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, plan: P
     return list(sources.values())
 
 
-def identify(sources: Sequence[Source], entries: Sequence[EpisodeEntry], plan: Plan) -> list[tuple[Source, str]]:
-    """The episode id of each source, by the rule above; fills `plan.replaced` and `plan.notes`."""
+def identify(
+    sources: Sequence[Source], entries: Sequence[EpisodeEntry], plan: Plan, removed: Removed | None = None
+) -> list[tuple[Source, str]]:
+    """The episode id of each source, by the rule above; fills `plan.replaced` and `plan.notes`. What was removed keeps its id."""
+    removed = removed or {}
     stored = {entry.source_sha256: entry for entry in entries}
+    gone = {episode.source_sha256: id for id, episode in removed.items()}
     claimed = {stored[source.sha256].id for source in sources if source.sha256 in stored}
-    taken = {entry.id for entry in entries}
+    taken = {*removed, *(entry.id for entry in entries)}
     found: list[tuple[Source, str]] = []
     for log, group in groupby(sources, key=lambda source: source.log):
         members = list(group)
@@ -140,6 +162,8 @@ def identify(sources: Sequence[Source], entries: Sequence[EpisodeEntry], plan: P
         for source in members:
             if source.sha256 in stored:
                 episode_id = stored[source.sha256].id
+            elif source.sha256 in gone:
+                episode_id = gone[source.sha256]
             elif source.demonstration.name in replaceable:
                 episode_id = replaceable[source.demonstration.name]
                 plan.replaced.add(episode_id)
@@ -152,6 +176,25 @@ def identify(sources: Sequence[Source], entries: Sequence[EpisodeEntry], plan: P
             ids = new[0] if len(new) == 1 else f"{new[0]} and {len(new) - 1} more"
             plan.notes.append(f"{log}: not the {log.name} ingested before; both are kept, this one as {ids}")
     return found
+
+
+def _edits_to_keep(entry: EpisodeEntry | None, source: Source, plan: Plan) -> Edits | None:
+    """What people did to the stored episode, where this source is the same demonstration; where it is another, a note says it is lost."""
+    edits = edits_of(entry) if entry is not None else Edits()
+    if entry is None or not edits.any:
+        return None
+    if entry.source_sha256 == source.sha256:
+        return edits
+    lost = " and ".join(["its labels"] * bool(edits.set or edits.unset) + ["its trim"] * (edits.start_ns is not None))
+    plan.notes.append(
+        f"{entry.id}: the log changed, so {lost} no longer hold; `vilp-data undo` brings the episode back as it was"
+    )
+    return None
+
+
+def _failed(source: Source, edits: Edits | None) -> bool:
+    """Whether the log says that the demonstration failed, and no label says otherwise."""
+    return outcome_of(source.demonstration.tags) == "failure" and not (edits and edits.calls_it_no_failure)
 
 
 def _replaceable(
@@ -172,6 +215,17 @@ def _free_id(source: Source, taken: set[str]) -> str:
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).lstrip(".") or "episode"
     candidates = (name, f"{name}-{source.sha256[:8]}", f"{name}-{source.sha256}")
     return next(candidate for candidate in candidates if candidate not in taken)
+
+
+def _no_longer_cut(sources: Sequence[Source], others: Sequence[EpisodeEntry], spec: TaskSpec) -> list[str]:
+    """Stored demonstrations of today's logs whose range is in the ranges file no more."""
+    given, stated = {source.log.name for source in sources}, {row.text for row in spec.episodes.rows}
+    gone = [
+        entry.id for entry in others
+        if entry.source in given and spec.episodes.kind == "ranges" and entry.tags.get(CUT_TAG, "") not in (*stated, "")
+    ]  # fmt: skip
+    listed = ", ".join(gone[:5]) + (f" and {len(gone) - 5} more" if len(gone) > 5 else "")
+    return [f"{listed}: stored, and no longer in {spec.episodes.by}; `vilp-data remove` takes them out"] if gone else []
 
 
 # --- what must not be mixed ------------------------------------------------------------------------------------------------
@@ -197,5 +251,7 @@ def _refuse_another_spec(store: EpisodeStore, staying: Sequence[EpisodeEntry], f
             "one dataset cannot hold episodes of two specs",
             where=store.root,
             found=f"{difference} ({entry.id} of {entry.source}, one of {len(differing)} that would stay as they are)",
-            remedy="give the logs of all its episodes, to ingest them anew, or name another folder with --into",
+            remedy="name another folder with --into, or take out what is cut otherwise now (`vilp-data remove`; all of it: the folder)"
+            if difference.startswith("episodes")
+            else "give the logs of all its episodes, to ingest them anew, or name another folder with --into",
         )

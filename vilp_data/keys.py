@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import mmap
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 FORMAT_VERSION = 1
 """Version of the episode and latent files. Raised when their bytes for the same input change."""
+
+BLOCK_BYTES = 16 << 20
 
 
 def digest(value: Any) -> str:
@@ -25,8 +29,19 @@ def content_digest(*arrays: npt.NDArray[Any]) -> str:
     sha = hashlib.sha256()
     for array in arrays:
         sha.update(f"{array.dtype.str}{array.shape};".encode())
-        sha.update(array.tobytes())
+        for part in byte_blocks(array):
+            sha.update(part)
     return sha.hexdigest()
+
+
+def byte_blocks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
+    """The bytes of an array, row after row, some at a time. Of a mapped file only the block at hand is kept in memory: an episode's
+    frames may be many times larger."""
+    flat = np.asarray(array, order="C").reshape(-1).view(np.uint8)
+    for start in range(0, len(flat), BLOCK_BYTES):
+        yield flat[start : start + BLOCK_BYTES].data
+        if isinstance(mapped := getattr(array, "_mmap", None), mmap.mmap):
+            mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def episode_key(*, source_sha256: str, source_episode: str, ingest_fields: Mapping[str, Any]) -> str:
@@ -35,6 +50,16 @@ def episode_key(*, source_sha256: str, source_episode: str, ingest_fields: Mappi
     return digest(
         {"format": FORMAT_VERSION, "source": source_sha256, "episode": source_episode, "ingest": dict(ingest_fields)}
     )
+
+
+def trimmed_key(key: str, first_step: int, end_step: int) -> str:
+    """Key of an episode of which some steps were left out since: that of its ingest, and which steps of the whole it keeps."""
+    return f"{ingest_key(key)}:{first_step}-{end_step}"
+
+
+def ingest_key(key: str) -> str:
+    """The key that ingest gave an episode, whatever was trimmed since."""
+    return key.partition(":")[0]
 
 
 def first_difference(old: Any, new: Any, path: str = "") -> str | None:

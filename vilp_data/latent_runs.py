@@ -11,7 +11,7 @@ from vilp_data import shards
 from vilp_data.dataset_split import find_split, side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
-from vilp_data.keys import digest
+from vilp_data.keys import digest, ingest_key
 from vilp_data.latents import LatentJob, encode_episodes, load_encoder, missing_latents, open_latents
 from vilp_data.spec import TaskSpec
 from vilp_data.stats import ChannelStats
@@ -92,9 +92,8 @@ def encode_dataset(
         jobs = missing_latents(store, encoder_name, run_dir, done.keys)
         _encode(store, jobs, done, workers=max(1, min(workers, len(jobs))), progress=progress)
         done.shards = dict.fromkeys(done.keys, len(store.index()))
-        done.unseen = tuple(
-            entry.id for entry in train if any(entry.key not in encoder.trained_on for encoder in encoders.values())
-        )
+        trained_on = [{ingest_key(key) for key in encoder.trained_on} for encoder in encoders.values()]
+        done.unseen = tuple(entry.id for entry in train if any(entry.ingest_key not in seen for seen in trained_on))
         if train:
             write_stats(root, done.keys, train)
     return done
@@ -110,7 +109,7 @@ def _encode(
 ) -> None:
     """Make the shards and enter into `done` how many and how fast."""
     entries = {entry.id: entry for entry in store.index()}
-    total = sum(entries[job.episode_id].n_frames[job.view] for job in jobs)
+    total = sum(entries[job.episode_id].stored_frames(job.view) for job in jobs)
     seconds, bare = 0.0, 0.0
     done.written = dict.fromkeys(done.keys, 0)
     with contextlib.closing(encode_episodes(jobs, workers=workers)) as made:

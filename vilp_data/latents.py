@@ -6,7 +6,7 @@ import contextlib
 import importlib.metadata
 import json
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, cast
@@ -54,11 +54,11 @@ class FrameEncoder(Protocol):
         ...
 
     def encode(self, frames: U8) -> F16:
-        """uint8 [B,H,W,3] -> float16 [B,c,h,w], before quantisation."""
+        """uint8 [B,H,W,C] -> float16 [B,c,h,w], before quantisation; C is 3, or 1 for a depth view."""
         ...
 
     def decode(self, latents: F16) -> U8:
-        """float16 [B,c,h,w] -> quantised -> uint8 [B,H,W,3]."""
+        """float16 [B,c,h,w] -> quantised -> uint8 [B,H,W,C]."""
         ...
 
     def latent_shape(self, height: int, width: int) -> tuple[int, int, int]:
@@ -111,24 +111,34 @@ def stale_reason(root: Path, entry: EpisodeEntry, view: str, key: str) -> str | 
 
 
 def open_latents(root: Path, entry: EpisodeEntry, view: str, key: str) -> F16:
-    """The mapped latents float16 [n,c,h,w] of one episode and view: by their header, those of the frames it has today.
+    """The mapped latents float16 [n,c,h,w] of one episode and view: by their header, those of the frames it has today. Row i belongs to
+    frame i of `episode_files.open_frames`.
 
     Raises StoreError where they are missing or of other frames. Bytes are not checksummed: see `episode_files`."""
-    path = latents_path(root, view, key, entry.id)
-    shard = shards.open_shard(path)
+    return _of_today(latents_path(root, view, key, entry.id), shards.open_shard, entry, view)
+
+
+def read_latents(root: Path, entry: EpisodeEntry, view: str, key: str) -> F16:
+    """As `open_latents`, read into memory with the checksum verified."""
+    return _of_today(latents_path(root, view, key, entry.id), shards.read_shard, entry, view)
+
+
+def _of_today(path: Path, read: Callable[[Path], shards.Shard], entry: EpisodeEntry, view: str) -> F16:
+    shard = read(path)
     latents = shard.arrays["latents"]
     why = _other_frames(shard.metadata, len(latents), entry, view)
     if why is not None:
         remedy = "run `vilp-data latents`"
         raise StoreError("latents of other frames than the episode has today", where=path, found=why, remedy=remedy)
-    return cast(F16, latents)
+    first = entry.first_frame(view)  # a trimmed episode keeps the latents of its whole frames file
+    return cast(F16, latents[first : first + entry.n_frames[view]])
 
 
 def _other_frames(metadata: Mapping[str, str], n_latents: int, entry: EpisodeEntry, view: str) -> str | None:
     if metadata.get("source_frames_sha256") != entry.frames_sha256[view]:
         return "the episode's frames changed (source_frames_sha256)"
-    if n_latents != entry.n_frames[view]:
-        return f"{n_latents} latents of {entry.n_frames[view]} frames"
+    if n_latents != entry.stored_frames(view):
+        return f"{n_latents} latents of {entry.stored_frames(view)} frames"
     return None
 
 
@@ -169,7 +179,7 @@ def encode_one(job: LatentJob) -> EncodedShard:
     entry = store.entry_from_header(store.steps_path(job.episode_id))
     bare = _bare_frames_per_s(job, store, entry)
     started = time.perf_counter()
-    frames = store.read_frames(job.view, entry)
+    frames = store.read_stored_frames(job.view, entry)
     latents = np.concatenate(list(encode_batches(encoder, frames)))
     path = latents_path(job.root, job.view, job.key, job.episode_id)
     if not np.isfinite(latents).all():
@@ -187,7 +197,7 @@ def encode_one(job: LatentJob) -> EncodedShard:
 
 
 def encode_batches(encoder: FrameEncoder, frames: U8) -> Iterator[F16]:
-    """float16 [b,c,h,w] for each BATCH of uint8 [n,H,W,3]."""
+    """float16 [b,c,h,w] for each BATCH of uint8 [n,H,W,C]."""
     for start in range(0, len(frames), BATCH):
         yield encoder.encode(frames[start : start + BATCH])
 

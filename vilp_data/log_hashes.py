@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -49,6 +50,17 @@ class HashCache:
             self._known[place] = {"look": look, "sha256": hashes}
             self._changed = True
         return hashes
+
+    def of_look(self, path: Path, what: str, find: Callable[[], Any]) -> Any:
+        """Plain data about a log that `of_log` was asked for: `find()`, remembered under `what`."""
+        known = self._known.get(str(path.resolve()))
+        if not isinstance(known, dict) or known.get("look") != _look_of(path)[0]:
+            return find()
+        found = known.setdefault("found", {})
+        if what not in found:
+            found[what] = find()
+            self._changed = True
+        return found[what]
 
     def save(self) -> None:
         """Write what was learnt, if anything was."""

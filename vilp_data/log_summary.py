@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_image, is_wall_clock
+from vilp_data.decode_depth import is_depth, measured_depth
+from vilp_data.decode_video import VideoDecoder, is_video, video_codec
 from vilp_data.errors import VilpDataError
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.types import I64, Message, TopicInfo
@@ -17,7 +19,13 @@ from vilp_data.types import I64, Message, TopicInfo
 GLANCE = 20  # messages of a topic that are decoded
 FAR_APART_S = 1.0  # a header this far from the log time is worth a word
 SHOWN_METADATA = 60  # characters of a metadata value in the terminal
-CLOCKS = {"wall": "wall clock", "simulated": "simulated clock", "none": "the row's number over an assumed rate"}
+RELATIVE = ("hdf5", "lerobot")  # formats that count time from the first demonstration's start
+CLOCKS = {
+    "wall": "wall clock",
+    "simulated": "simulated clock",
+    "relative": "counted from the first demonstration",
+    "none": "the row's number over an assumed rate",
+}
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,8 @@ class TopicSummary:
 class LogSummary:
     """A whole log. `sampled` names the figures that rest on a part of it only.
 
-    log_clock       "wall", "simulated" (starting before the year 2000), or "none" for logs whose rows carry no time
+    log_clock       "wall", "simulated" (starting before the year 2000), "relative" to the first demonstration's start, or "none"
+                    for logs whose rows carry no time
     assumed_rate_hz the rate that stands in for time where rows carry none, so rates and durations follow from it; else None
     """
 
@@ -77,7 +86,7 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
         topics = tuple(_topic(log, topic, times.get(topic.name)) for topic in log.topics())
         start_ns = episodes[0].start_ns if episodes else None
         duration_s = (episodes[-1].end_ns - episodes[0].start_ns) / 1e9 if episodes else 0.0
-        timeless = log.format == "zarr"
+        assumed_rate_hz = getattr(log, "assumed_rate_hz", None)
         return LogSummary(
             path=str(path),
             format=log.format,
@@ -85,8 +94,8 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
             n_episodes=len(episodes),
             start_ns=start_ns,
             duration_s=duration_s,
-            log_clock="none" if start_ns is None or timeless else _clock_kind(start_ns),
-            assumed_rate_hz=array_rate_hz if timeless else None,
+            log_clock=_log_clock(log.format, start_ns, assumed_rate_hz),
+            assumed_rate_hz=assumed_rate_hz,
             topics=topics,
             metadata=log.metadata(),
             sampled=_sampled(complete, times, start_ns),
@@ -141,10 +150,26 @@ def _intervals(times: I64 | None) -> tuple[float | None, float | None, int | Non
 
 
 def _image(messages: list[Message]) -> str | None:
-    if not messages or not is_image(messages[0]):
+    if not messages:
         return None
-    height, width, _ = decode_image(messages[0]).shape
-    return f"{height}x{width} {image_encoding(messages[0])}"
+    first = messages[0]
+    if is_video(first):
+        return _video(messages)
+    if not is_image(first):
+        return None
+    height, width = (measured_depth(first) if is_depth(first) else decode_image(first)).shape[:2]
+    return f"{height}x{width} {image_encoding(first)}"
+
+
+def _video(messages: list[Message]) -> str:
+    """The size of the first picture that these packets give."""
+    decoder, codec = VideoDecoder(), video_codec(messages[0])
+    for number, message in enumerate(messages):
+        for _, frame in decoder.feed(number, message):
+            return f"{frame.height}x{frame.width} {codec}"
+    for _, frame in decoder.rest():
+        return f"{frame.height}x{frame.width} {codec}"
+    return f"{codec}, no picture in the first {len(messages)} messages"
 
 
 def _header_clock(messages: list[Message]) -> tuple[str | None, float | None]:
@@ -155,6 +180,12 @@ def _header_clock(messages: list[Message]) -> tuple[str | None, float | None]:
     if not any(header for header, _ in stamps):
         return "zero", None
     return _clock_kind(stamps[0][0]), float(np.median([log_time - header for header, log_time in stamps])) / 1e9
+
+
+def _log_clock(log_format: str, start_ns: int | None, assumed_rate_hz: float | None) -> str:
+    if start_ns is None or assumed_rate_hz is not None:
+        return "none"
+    return "relative" if log_format in RELATIVE else _clock_kind(start_ns)
 
 
 def _clock_kind(time_ns: int) -> str:

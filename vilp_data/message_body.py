@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from typing import Any
 
 from vilp_data.errors import DecodeError
@@ -18,14 +19,24 @@ def require_member(value: Any, name: str) -> Any:
     """A member by name; of a list of messages (foxglove.JointStates), that member of each. AttributeError or KeyError if absent."""
     if isinstance(value, dict):
         return value[name]
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+    if _holds_items(type(value)):  # type: ignore[arg-type]
         return [require_member(item, name) for item in value]
     return getattr(value, name)
 
 
+@cache
+def _holds_items(kind: type) -> bool:
+    """Whether a type is a list of things; asked once a type, for asking an abstract class costs more than the rest of a path."""
+    return issubclass(kind, Sequence) and not issubclass(kind, str | bytes)
+
+
 def first_member(value: Any, names: Iterable[str]) -> Any:
     """The first of these members that is there, None where none is."""
-    return next((found for name in names if (found := member(value, name)) is not None), None)
+    for name in names:  # a loop, for this is asked of every message
+        found = value.get(name) if isinstance(value, dict) else getattr(value, name, None)
+        if found is not None:
+            return found
+    return None
 
 
 def member_names(value: Any) -> list[str]:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vilp_data.errors import BusyError, StoreError
+from vilp_data.keys import byte_blocks
 
 # Names of the safetensors format for the dtypes stored here.
 _DTYPES = {
@@ -66,7 +67,7 @@ def write_shard(path: Path, tensors: Mapping[str, npt.NDArray[Any]], metadata: M
 
     Raises StoreError where the disk is full or the folder cannot be written; `path` is then as it was before."""
     arrays = {
-        name: np.asarray(tensors[name], order="C")
+        name: np.asanyarray(tensors[name], order="C")
         for name in sorted(tensors, key=lambda n: (-tensors[n].dtype.itemsize, n))
     }
     layout: dict[str, Any] = {}
@@ -84,7 +85,7 @@ def write_shard(path: Path, tensors: Mapping[str, npt.NDArray[Any]], metadata: M
             "data_offsets": [offset, offset + array.nbytes],
         }
         offset += array.nbytes
-    checksum = _checksum(layout, metadata, (_bytes(array) for array in arrays.values()))
+    checksum = _checksum(layout, metadata, (part for array in arrays.values() for part in byte_blocks(array)))
     header = json.dumps(
         {"__metadata__": {**metadata, _CHECKSUM: checksum}, **layout}, sort_keys=True, separators=(",", ":")
     ).encode()
@@ -93,7 +94,8 @@ def write_shard(path: Path, tensors: Mapping[str, npt.NDArray[Any]], metadata: M
         file.write(struct.pack("<Q", len(header)))
         file.write(header)
         for array in arrays.values():
-            file.write(_bytes(array))
+            for part in byte_blocks(array):
+                file.write(part)
 
 
 def read_header(path: Path) -> ShardHeader:
@@ -172,7 +174,8 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def writer_lock(root: Path) -> Iterator[None]:
-    """Be the only writer of the dataset at `root` for the length of the block, and clear away what a killed writer left.
+    """Be the only writer of the dataset at `root` for the length of the block, once what a killed writer had committed is finished and
+    what it left besides is cleared away.
 
     Raises BusyError at once where another process is writing."""
     try:
@@ -192,14 +195,17 @@ def writer_lock(root: Path) -> Iterator[None]:
             raise BusyError(
                 "another process is writing this dataset", where=root, remedy="wait until it is done, or stop it"
             ) from error
+        from vilp_data import journal  # which is made of this module
+
         _remove_leftovers(root)
+        journal.settle(root)
         yield
     finally:
         os.close(descriptor)
 
 
 def _remove_leftovers(root: Path) -> None:
-    for folder in ("", "episodes", "latents", "action_sets"):
+    for folder in ("", "episodes", "latents", "action_sets", "history"):
         for leftover in _temporary_files(root, folder):
             leftover.unlink(missing_ok=True)
     # Recorders and trainers write here without this lock: only what is surely nobody's goes.
@@ -211,10 +217,6 @@ def _remove_leftovers(root: Path) -> None:
 
 def _temporary_files(root: Path, folder: str) -> list[Path]:
     return list((root / folder).glob("**/.*.tmp" if folder else ".*.tmp"))
-
-
-def _bytes(array: npt.NDArray[Any]) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data
 
 
 def sync_folder(folder: Path) -> None:

@@ -8,8 +8,17 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
+from vilp_data.episodes_spec import EpisodesSpec, read_ranges
 from vilp_data.errors import SpecError, nearest
 from vilp_data.types import Clock
 
@@ -36,26 +45,100 @@ class TopicSpec(Frozen):
     stale_after_s: float = Field(default=0.5, gt=0)
 
 
+class DepthSpec(Frozen):
+    """What the numbers of a depth view mean, and which distances its stored levels span.
+
+    unit           of the numbers in the messages: "mm" or "m"
+    near_m, far_m  stored as 1 and as 255; nearer and farther readings are clipped to them. 0 is stored where there is no reading
+    """
+
+    unit: Literal["mm", "m"]
+    near_m: float = Field(ge=0, allow_inf_nan=False)
+    far_m: float = Field(gt=0, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.near_m >= self.far_m:
+            raise ValueError(f"near_m = {self.near_m} must be less than far_m = {self.far_m}")
+        return self
+
+
 class ViewSpec(TopicSpec):
-    """A camera, and the size its images are stored at. `fit` says what to do with another aspect ratio; unstated is refused."""
+    """A camera, and the size its images are stored at. `fit` says what to do with another aspect ratio; unstated is refused.
+
+    depth   the topic measures distance: frames are stored with one channel instead of three
+    levels  (black, white) of a camera of one channel and 16 bits, whose messages do not say how bright white is
+    """
 
     height: int = Field(gt=0)
     width: int = Field(gt=0)
     fit: Literal["crop", "pad", "stretch"] | None = None
+    depth: DepthSpec | None = None
+    levels: tuple[int, int] | None = None
+
+    @model_validator(mode="after")
+    def _one_meaning(self) -> Self:
+        if self.depth is not None and self.levels is not None:
+            raise ValueError("`depth` is of distances and `levels` of grey pictures: a view has one of them")
+        if self.levels is not None and not 0 <= self.levels[0] < self.levels[1] <= 65535:
+            raise ValueError(f"levels = {list(self.levels)}: black comes before white, both within 0 to 65535")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _as_stated(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """`depth` and `levels` only where they are stated: a view without them keeps the key that it had before there were any."""
+        unstated = [name for name in ("depth", "levels") if getattr(self, name) is None]
+        return {name: value for name, value in plain(self).items() if name not in unstated}
+
+    @property
+    def channels(self) -> int:
+        """Of the stored frames: 1 for depth, 3 (RGB) for pictures."""
+        return 3 if self.depth is None else 1
 
 
-class VectorSpec(TopicSpec):
+class FramesSpec(Frozen):
+    """For topics of transforms (tf): the vector is where `to_frame` lies in `from_frame`, translation x y z and unit quaternion x y z w
+    of continuous sign, resolved through the tree of frames. Transforms of the topic with `_static` after its name hold always.
+    """
+
+    from_frame: str | None = None
+    to_frame: str | None = None
+
+    @model_validator(mode="after")
+    def _two_frames(self) -> Self:
+        if (self.from_frame is None) != (self.to_frame is None):
+            raise ValueError("from_frame and to_frame go together: the vector is where to_frame lies in from_frame")
+        if self.from_frame is not None and self.from_frame.lstrip("/") == str(self.to_frame).lstrip("/"):
+            raise ValueError(f"from_frame and to_frame are both {self.from_frame!r}: a frame never moves in itself")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _with_frames_if_stated(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without the two frames where none is stated: such a vector keeps the key that it had before there were any."""
+        unstated = ("from_frame", "to_frame") if self.from_frame is None else ()
+        return {name: value for name, value in plain(self).items() if name not in unstated}
+
+
+class VectorSpec(TopicSpec, FramesSpec):
     """A vector read from a topic's messages.
 
-    fields  paths into the message, concatenated: "pose.position.x", "position", "position[0:7]", "[0:2]" for a bare array
-    names   for messages with parallel `name` lists (JointState): which joints, in this order; a robot may publish any order
+    fields  paths into the message, concatenated: "pose.position.x", "position[0:7]", "pose" (its seven numbers), "[0:2]" for a
+            bare array; unstated: what is usual for the message's type. Of two frames: "translation", "rotation", "translation.x", …
+    names   for messages with parallel `name` lists (JointState): which joints, in this order; a robot may publish any order, and
+            messages of other joints only are passed over
     """
 
     fields: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
 
+    @model_validator(mode="after")
+    def _no_names_of_frames(self) -> Self:
+        if self.from_frame is not None and self.names:
+            raise ValueError("`names` is of joints, from_frame of transforms: a vector is one of them")
+        return self
 
-class ActionSpec(Frozen):
+
+class ActionSpec(FramesSpec):
     """One part of the action vector: a command topic, or a state some steps ahead for logs that recorded no commands.
 
     kind "absolute": the last command issued in [t_k, t_{k+1}), else the one still held (grippers too)
@@ -83,6 +166,10 @@ class ActionSpec(Frozen):
         if (self.topic is None) == (self.from_ is None):
             raise ValueError(
                 "an action part needs exactly one of `topic` (recorded commands) and `from` (a low_dim part, `shift` steps ahead)"
+            )
+        if self.from_frame is not None and (self.topic is None or self.kind != "absolute" or self.names):
+            raise ValueError(
+                'an action between two frames is `topic`, from_frame and to_frame, of kind "absolute", without `names`'
             )
         if self.kind == "delta_rotation" and self.frame not in ("base", "world", "tool"):
             raise ValueError(
@@ -131,15 +218,17 @@ class RecordSpec(Frozen):
 class TaskSpec(Frozen):
     """A task: what its logs hold, on which clock, at which size, and how models train on it.
 
-    rate_hz None means the rate of the slowest camera. `models` holds the tables of vilp_models, which validates them.
+    rate_hz None means the rate of the slowest camera. A task without views is of logs without cameras: it can be ingested, looked at,
+    checked and exported, and only behaviour cloning trains on it. `models` holds the tables of vilp_models, which validates them.
     """
 
     name: str
     rate_hz: float | None = Field(default=None, gt=0)
-    views: dict[str, ViewSpec] = Field(min_length=1)
+    views: dict[str, ViewSpec] = {}
     low_dim: dict[str, VectorSpec] = {}
     action: dict[str, ActionSpec] = {}
     state: VectorSpec | None = None
+    episodes: EpisodesSpec = EpisodesSpec()
     split: SplitSpec = SplitSpec()
     window: WindowSpec = WindowSpec()
     sim: SimSpec | None = None
@@ -160,6 +249,25 @@ class TaskSpec(Frozen):
         for view in [*self.views, self.name]:
             if not view.replace("_", "").replace("-", "").isalnum():
                 raise ValueError(f"{view!r} becomes a folder's name: letters, digits, - and _ only")
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_step_by(self) -> Self:
+        if not self.views and not self.low_dim:
+            raise ValueError(
+                "a task needs a view ([views.NAME]), or for logs without cameras a low_dim part ([low_dim.NAME])"
+            )
+        if not self.views and self.rate_hz is None:
+            raise ValueError("a task without views states its rate_hz: there is no camera to take it from")
+        return self
+
+    @model_validator(mode="after")
+    def _one_reading_a_topic(self) -> Self:
+        readings: dict[str, bool] = {}
+        for spec in self._topic_specs():
+            frames = getattr(spec, "from_frame", None) is not None
+            if readings.setdefault(str(spec.topic), frames) != frames:
+                raise ValueError(f"topic {spec.topic!r} is read both as transforms (from_frame) and otherwise")
         return self
 
     @model_validator(mode="after")
@@ -198,7 +306,8 @@ class TaskSpec(Frozen):
             fields[vector] = [{"part": name, **table} for name, table in fields[vector].items()]
         for part in fields["action"]:
             del part["holds"]
-        return fields
+        cuts = self.episodes.ingest_fields()
+        return fields if cuts is None else fields | {"episodes": cuts}
 
 
 def load_task(name_or_path: str, *, preset: str | None = None) -> TaskSpec:
@@ -209,7 +318,8 @@ def load_task(name_or_path: str, *, preset: str | None = None) -> TaskSpec:
             raise SpecError(
                 "no such task file", where=path, remedy="give a path to a TOML, or one of: " + ", ".join(task_names())
             )
-        return parse_task(path.read_text(encoding="utf-8"), where=str(path), preset=preset)
+        task = parse_task(path.read_text(encoding="utf-8"), where=str(path), preset=preset)
+        return _with_ranges(task, path.parent)
     if name_or_path not in task_names():
         raise SpecError(
             f"no task called {name_or_path!r}",
@@ -217,6 +327,20 @@ def load_task(name_or_path: str, *, preset: str | None = None) -> TaskSpec:
         )
     text = (resources.files("pipelines") / f"{name_or_path}.toml").read_text(encoding="utf-8")
     return parse_task(text, where=f"pipelines/{name_or_path}.toml", preset=preset)
+
+
+def _with_ranges(task: TaskSpec, folder: Path) -> TaskSpec:
+    """The task with the rows of its ranges file, which lies beside the TOML unless its path says otherwise."""
+    if task.episodes.kind != "ranges":
+        return task
+    path = folder / task.episodes.by
+    try:
+        rows = read_ranges(path.read_text(encoding="utf-8"), where=str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        found = getattr(error, "strerror", None) or "not text in UTF-8"
+        remedy = "episodes.by is a path from the task TOML's folder"
+        raise SpecError("the ranges file cannot be read", where=path, found=found, remedy=remedy) from error
+    return task.model_copy(update={"episodes": task.episodes.model_copy(update={"rows": rows})})
 
 
 def task_names() -> list[str]:
@@ -285,9 +409,11 @@ def _complaints(error: ValidationError) -> list[str]:
 
 def _known_keys(location: tuple[int | str, ...]) -> list[str]:
     """Keys allowed in the table that holds the key at `location`."""
-    tables: dict[str, type[Frozen]] = {
+    tables: dict[str, type[BaseModel]] = {
         "views": ViewSpec, "low_dim": VectorSpec, "action": ActionSpec, "state": VectorSpec,
-        "split": SplitSpec, "window": WindowSpec, "sim": SimSpec, "record": RecordSpec,
+        "episodes": EpisodesSpec, "split": SplitSpec, "window": WindowSpec, "sim": SimSpec, "record": RecordSpec,
     }  # fmt: skip
     table = tables.get(str(location[0]), TaskSpec) if len(location) > 1 else TaskSpec
+    if table is ViewSpec and location[2:3] == ("depth",) and len(location) > 3:
+        table = DepthSpec
     return sorted(info.alias or name for name, info in table.model_fields.items())

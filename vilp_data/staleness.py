@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from vilp_data import shards
+from vilp_data.demonstrations import CUT_TAG
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import VilpDataError
 from vilp_data.keys import first_difference
@@ -19,10 +20,20 @@ def stale_episodes(root: Path, spec: TaskSpec) -> dict[str, str]:
     """Episode id -> the field of the ingest spec that changed, and how. Empty where all fit `spec`."""
     fields = spec.ingest_fields()
     reasons = {}
+    ranges = {row.text for row in spec.episodes.rows} if spec.episodes.kind == "ranges" else None
     for entry in EpisodeStore(root).index():
+        if ranges is not None and entry.ingest.get("episodes") and entry.tags.get(CUT_TAG) not in ranges:
+            was = entry.tags.get(CUT_TAG, "its range")
+            reasons[entry.id] = (
+                f"episodes: {was} is no longer in {spec.episodes.by}; ingest its log again, or `vilp-data remove` it"
+            )
         difference = first_difference(entry.ingest, fields)
         if difference is not None:
-            reasons[entry.id] = f"{difference}; run `vilp-data ingest` on {entry.source} again"
+            way = f"run `vilp-data ingest` on {entry.source} again"
+            way += "; what it does not cut out any more, `vilp-data remove` takes out" * difference.startswith(
+                "episodes"
+            )
+            reasons[entry.id] = f"{difference}; {way}"
     return reasons
 
 
@@ -33,7 +44,7 @@ def stale_latents(root: Path, spec: TaskSpec) -> dict[str, str]:
     for run in sorted(path for path in (root / "runs").glob("*") if path.is_dir()):
         for view in spec.views:
             try:
-                encoder = _encoder_of(run, view)
+                encoder = run_encoder(run, view)
             except VilpDataError as error:
                 reasons[str(run)] = str(error)
                 continue
@@ -55,7 +66,7 @@ def stale_latents(root: Path, spec: TaskSpec) -> dict[str, str]:
     return reasons
 
 
-def _encoder_of(run: Path, view: str) -> FrameEncoder | None:
+def run_encoder(run: Path, view: str) -> FrameEncoder | None:
     """The encoder that was trained into `run`: of the kind whose name the folder begins with, as `find_run` reads it, else of
     the first kind that loads. None for the run of another model."""
     named = [name for name in encoder_names() if run.name.startswith(name)]

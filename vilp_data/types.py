@@ -44,11 +44,20 @@ def is_rollout(tags: Mapping[str, str]) -> bool:
     return tags.get(name) == value
 
 
+OUTCOME_TAG = "success"
+
+
+def outcome_of(tags: Mapping[str, str]) -> Outcome:
+    """What tags say of an episode: the tag `success`, "true" or "false"."""
+    outcomes: dict[str, Outcome] = {"true": "success", "false": "failure"}
+    return outcomes.get(tags.get(OUTCOME_TAG, "").lower(), "unknown")
+
+
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """One topic of a log. `schema` is the name the log uses (`sensor_msgs/msg/Image`, `foxglove.CompressedImage`, `array`);
-    `encoding` is how its messages are written (`cdr`, `protobuf`, `json`, `array`); `message_count` is None where the log has
-    no index to tell."""
+    """One topic of a log. `schema` is the name the log uses (`foxglove.CompressedImage`, `array`), of ROS types always the form
+    `sensor_msgs/msg/Image`; `encoding` is how its messages are written (`cdr`, `ros1`, `protobuf`, `json`, `array`);
+    `message_count` is None where the log has no index to tell."""
 
     name: str
     schema: str
@@ -86,7 +95,7 @@ class LogReader(Protocol):
     def path(self) -> PurePath: ...
     @property
     def format(self) -> str:
-        """Short name of the format: `mcap`, `zarr`."""
+        """Short name of the format: `mcap`, `rosbag1`, `rosbag2`, `zarr`, …"""
         ...
 
     def sha256(self) -> str:
@@ -126,7 +135,8 @@ class LogReader(Protocol):
 class Episode:
     """One demonstration on one control clock, ready to store.
 
-    frames        view name -> uint8 [n,H,W,3], RGB, top row first; each camera image once, in order of time
+    frames        view name -> uint8 [n,H,W,3], RGB, or [n,H,W,1] of a depth view (0: no reading); top row first; each camera image
+                  once, in order of time
     source_index  view name -> int32 [F]: which of the n frames is the observation at each step
     log_time_ns   int64 [F]: the control ticks
     low_dim       float32 [F,L]

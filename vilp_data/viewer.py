@@ -13,17 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from vilp_data import shards
-from vilp_data.decode import is_image, is_wall_clock
+from vilp_data.decode import is_wall_clock
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import DecodeError, LogError, StoreError, UsageError, VilpDataError, nearest
-from vilp_data.latents import BATCH, FrameEncoder, latents_path, stale_reason
+from vilp_data.errors import DecodeError, LogError, UsageError, VilpDataError, nearest
+from vilp_data.latents import BATCH, FrameEncoder, read_latents, stale_reason
 from vilp_data.numeric_fields import numeric_series
 from vilp_data.plots import Plot, frame_psnr, panel_rank, vector_parts
 from vilp_data.sources import MessageError, open_log
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.types import F32, I32, I64, U8, LogEpisode, LogReader, Message
+from vilp_data.types import F16, F32, I32, I64, U8, LogEpisode, LogReader, Message
 from vilp_data.viewer_canvas import Canvas, Drawn, Picture, entity_of, title_of, writing
+from vilp_data.viewer_images import LogImages
 from vilp_data.viewer_window import present
 
 __all__ = ["Drawn", "draw_episode", "draw_log", "present"]
@@ -117,18 +117,21 @@ def _draw_messages(
     """(image topics, topic -> group -> plot) of one demonstration; images go to the file as they come."""
     cameras: dict[str, None] = {}
     plots: dict[str, dict[str, Plot]] = {}
+    images = LogImages(canvas)
     for message in _readable_messages(log, chosen, left_out):
         if progress is not None:
             progress(1)
-        if not is_image(message):
+        if not images.shows(message):
             _plot_message(plots.setdefault(message.topic, {}), message)
             continue
         try:
-            canvas.message_image(message)
+            images.draw(message)
         except DecodeError as error:
             left_out.message(message.topic, error)
         else:
             cameras[message.topic] = None
+    for topic, lost in images.end():
+        left_out.message(topic, lost)
     return sorted(cameras), {topic: panel for topic, panel in plots.items() if panel}
 
 
@@ -186,7 +189,7 @@ def draw_episode(
             if stale is not None:
                 notes.append(f"{view}: no reconstruction, its latents are {stale}; run `vilp-data latents`")
                 continue
-            rebuilt = _reconstruct(encoder, latents_path(store.root, view, encoder.key, episode_id), shown)
+            rebuilt = _reconstruct(encoder, read_latents(store.root, entry, view, encoder.key), shown)
             fidelity.append(_draw_reconstruction(canvas, view, frames[shown], rebuilt, times))
             rows[-1].append(Picture(f"{view}/reconstructed", f"{view}: reconstructed"))
             rows[-1].append(Picture(f"{view}/error", f"{view}: error × {ERROR_GAIN}"))
@@ -207,12 +210,7 @@ def _first_shown(source_index: I32, log_time_ns: I64) -> tuple[I64, I64]:
     return frames.astype(np.int64), log_time_ns[known][first]
 
 
-def _reconstruct(encoder: FrameEncoder, path: Path, rows: I64) -> U8:
-    latents = shards.read_shard(path).arrays["latents"]
-    if rows.size and int(rows[-1]) >= len(latents):
-        raise StoreError(
-            "fewer latents than frames", where=path, found=f"{len(latents)}", remedy="run `vilp-data latents` again"
-        )
+def _reconstruct(encoder: FrameEncoder, latents: F16, rows: I64) -> U8:
     batches = [encoder.decode(latents[rows[start : start + BATCH]]) for start in range(0, len(rows), BATCH)]
     return np.concatenate(batches)
 

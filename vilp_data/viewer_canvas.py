@@ -15,10 +15,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vilp_data import shards
-from vilp_data.decode import decode_image, encoded_image
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.plots import Plot
-from vilp_data.types import F64, I64, U8, Message
+from vilp_data.types import F64, I64, U8
 
 APPLICATION = "vilp"
 TIMELINE = "log_time"
@@ -73,21 +72,23 @@ class Canvas:
             return {"timestamp": np.datetime64(time_ns, "ns")}
         return {"duration": np.timedelta64(time_ns, "ns")}
 
-    def message_image(self, message: Message) -> None:
-        """One image message: its own bytes where a viewer can read those, else its pixels."""
-        encoded, entity = encoded_image(message), entity_of(message.topic)
-        if encoded is None:
-            self.frames(entity, decode_image(message)[None], np.array([message.log_time_ns]))
-            return
-        self._held.setdefault(entity, []).append((message.log_time_ns, *encoded))
-        self._held_bytes += len(encoded[0])
+    def encoded_image(self, entity: str, time_ns: int, data: bytes, media_type: str) -> None:
+        """One image as a file's bytes, `image/jpeg` or `image/png`."""
+        self._held.setdefault(entity, []).append((time_ns, data, media_type))
+        self._held_bytes += len(data)
         if self._held_bytes > FLUSH_BYTES:
             self._send_held()
 
+    def depth_image(self, entity: str, time_ns: int, png: bytes, units_a_metre: float) -> None:
+        """One image of distances, as a PNG of 16 bits, so many of whose units make a metre."""
+        self._recording.set_time(TIMELINE, **self.moment(time_ns))
+        self._recording.log(entity, rr.EncodedDepthImage(blob=png, media_type="image/png", meter=units_a_metre))
+
     def frames(self, entity: str, frames: U8, times_ns: I64) -> None:
-        """uint8 [n,H,W,3] at int64 [n]."""
-        _, height, width, _ = frames.shape
-        form = rr.components.ImageFormat(height=height, width=width, color_model="RGB", channel_datatype="U8")
+        """uint8 [n,H,W,3] RGB, or [n,H,W,1] grey, at int64 [n]."""
+        _, height, width, channels = frames.shape
+        colours = "L" if channels == 1 else "RGB"
+        form = rr.components.ImageFormat(height=height, width=width, color_model=colours, channel_datatype="U8")
         self._recording.log(entity, rr.Image.from_fields(format=form), static=True)
         columns = rr.Image.columns(buffer=frames.reshape(len(frames), -1))
         self._recording.send_columns(entity, indexes=[self._index(times_ns)], columns=columns)

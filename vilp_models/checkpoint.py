@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from vilp_data.episodes import EpisodeEntry
 from vilp_data.errors import SplitError, StoreError, UsageError, nearest
+from vilp_data.keys import ingest_key
 from vilp_data.shards import open_shard, read_header, read_shard, verify_shard, write_atomic, write_shard
 from vilp_models.contract import DataContract
 
@@ -155,8 +156,8 @@ def load_run(run: Path, kind: str, *, unfinished: bool = False) -> TrainedRun:
 def refuse_trained_on_validation(state: RunState, val: Sequence[EpisodeEntry], *, where: Path) -> None:
     """Raise SplitError where the run in `where` was trained on one of these episodes, by whatever name: it knows what it would be
     judged on."""
-    learnt = set(state.train_episodes.values())
-    leaked = sorted(entry.id for entry in val if entry.id in state.train_episodes or entry.key in learnt)
+    learnt = {ingest_key(key) for key in state.train_episodes.values()}
+    leaked = sorted(entry.id for entry in val if entry.id in state.train_episodes or entry.ingest_key in learnt)
     if leaked:
         raise SplitError(
             f"this {state.model} was trained on {len(leaked)} of the episodes to validate it on",

@@ -40,6 +40,7 @@ class DataContract:
     task           the task's name
     views          cameras, sorted
     geometry       view -> (height, width, fit) of stored frames; fit is "" where the spec states none
+    depth          view -> {unit, near_m, far_m} of the views that measure, whose frames have one channel; {} where none does
     rate_hz        of the control clock
     frame_stride   (paper Δt) steps between planned frames, or between the two frames of a pair
     n_plan_frames  (paper N); 0 for a model of pairs, and for behaviour cloning, whose windows are as long as its chunks
@@ -60,6 +61,7 @@ class DataContract:
     frame_stride: int
     n_plan_frames: int = 0
     max_goal_frames: int | None = None
+    depth: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     latent_keys: Mapping[str, str] = field(default_factory=dict)
     latent_shapes: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     low_dim: Fields = ()
@@ -154,6 +156,10 @@ class DataContract:
             action=self.action_size > 0,
         )
 
+    def image_channels(self, view: str) -> int:
+        """Of the view's stored frames: 3 for RGB, 1 for depth."""
+        return 1 if view in self.depth else 3
+
     def to_json(self) -> dict[str, Any]:
         """Plain data; `from_json` reads it back."""
         return asdict(self)
@@ -207,6 +213,7 @@ _WORDS: Mapping[str, tuple[str, str]] = {
     "task": ("another task", "name the dataset of that task with --data, or train again: {again}"),
     "views": ("other views", "ingest with the views it knows, or train again: {again}"),
     "geometry": ("another image geometry", "ingest with the task's old size and fit, or train again: {again}"),
+    "depth": ("another depth of its views", "ingest with the task's old `depth` tables, or train again: {again}"),
     "rate_hz": ("another control rate", "ingest at that rate (rate_hz in the task), or train again: {again}"),
     "frame_stride": (
         "another frame stride",
@@ -250,6 +257,7 @@ def _of_views(spec: TaskSpec) -> dict[str, Any]:
         "task": spec.name,
         "views": tuple(sorted(spec.views)),
         "geometry": {name: (view.height, view.width, view.fit or "") for name, view in sorted(spec.views.items())},
+        "depth": {name: view.depth.model_dump() for name, view in sorted(spec.views.items()) if view.depth is not None},
     }
 
 

@@ -12,6 +12,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from vilp_data.types import U8
+from vilp_models.contact_sheet import as_rgb
 
 FRAME_MS = 200
 FOLDER = "tensorboard"
@@ -32,7 +33,7 @@ class Curves:
             self._writer.add_scalar(name, value, step)
 
     def clips(self, step: int, clips: Mapping[str, U8]) -> None:
-        """Each clip uint8 [T,H,W,3] as an animated image."""
+        """Each clip, uint8 [T,H,W,3] or [T,H,W,1], as an animated image."""
         for name, frames in clips.items():
             image = Summary.Image(
                 height=frames.shape[1], width=frames.shape[2], colorspace=3, encoded_image_string=gif(frames)
@@ -46,8 +47,8 @@ class Curves:
 
 
 def gif(frames: U8) -> bytes:
-    """An endless GIF of uint8 [T,H,W,3]."""
-    first, *rest = [Image.fromarray(frame) for frame in frames]
+    """An endless GIF of uint8 [T,H,W,3], or of grey [T,H,W,1]."""
+    first, *rest = [Image.fromarray(frame) for frame in as_rgb(frames)]
     out = io.BytesIO()
     first.save(out, "GIF", save_all=True, append_images=rest, duration=FRAME_MS, loop=0)
     return out.getvalue()

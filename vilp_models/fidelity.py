@@ -14,8 +14,7 @@ from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, nearest
 from vilp_data.keys import digest
-from vilp_data.latents import BATCH, encode_batches, latents_path, stale_reason
-from vilp_data.shards import read_shard
+from vilp_data.latents import BATCH, encode_batches, read_latents, stale_reason
 from vilp_data.types import F16, I64, U8
 from vilp_models.checkpoint import checkpoint_digest, read_state, refuse_trained_on_validation, run_for_view
 from vilp_models.lpips import Lpips, load_lpips
@@ -237,10 +236,9 @@ def report_inputs(store: EpisodeStore, run_dir: Path, episodes: Sequence[str]) -
     return {
         "format": REPORT_FORMAT,
         "checkpoints": {view: checkpoint_digest(run_for_view(run_dir, view)) for view in views},
-        "frames": {e: {view: entries[e].frames_sha256[view] for view in views} for e in sorted(episodes)},
+        "frames": {e: {view: entries[e].frames_id(view) for view in views} for e in sorted(episodes)},
         "mean_frame_of": {
-            view: digest({e.id: e.frames_sha256[view] for e in _training_entries(entries, run_dir, view)})
-            for view in views
+            view: digest({e.id: e.frames_id(view) for e in _training_entries(entries, run_dir, view)}) for view in views
         },
     }
 
@@ -302,7 +300,7 @@ def _measure_view(
 
 def _latents(store: EpisodeStore, encoder: VqganEncoder, key: str, view: str, entry: EpisodeEntry, frames: U8) -> F16:
     if stale_reason(store.root, entry, view, key) is None:
-        return read_shard(latents_path(store.root, view, key, entry.id)).arrays["latents"]
+        return read_latents(store.root, entry, view, key)
     return np.concatenate(list(encode_batches(encoder, frames)))
 
 

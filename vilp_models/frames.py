@@ -22,7 +22,7 @@ MEDIAN_FRAMES = 64
 
 @dataclass
 class Clip:
-    """Mapped frames uint8 [n,H,W,3] of one view of one episode, and their temporal median [H,W,3] once asked for."""
+    """Mapped frames uint8 [n,H,W,C] of one view of one episode, and their temporal median [H,W,C] once asked for."""
 
     frames: U8
     median: U8 | None = None
@@ -49,6 +49,10 @@ class TrainingFrames:
             raise UsageError(
                 f"models.vqgan.crop = {crop} is larger than a frame", remedy=f"use at most {min(map(min, sizes))}"
             )
+        if len(channels := {clip.frames.shape[3] for clip in clips}) > 1:
+            found = f"frames of {' and '.join(map(str, sorted(channels)))} channels"
+            remedy = "ingest again: the view's `depth` was changed for some of its episodes only"
+            raise UsageError("pictures and depth cannot share batches", found=found, remedy=remedy)
         self.clips = [clip for clip in clips if len(clip.frames)]
         self.ends = np.cumsum([len(clip.frames) for clip in self.clips])
         self.crop, self.crop_moving = crop, crop_moving
@@ -60,11 +64,16 @@ class TrainingFrames:
         sizes = {(int(clip.frames.shape[1]), int(clip.frames.shape[2])) for clip in self.clips}
         return sizes | ({(self.crop, self.crop)} if self.crop is not None else set())
 
+    @property
+    def channels(self) -> int:
+        """Of every image: 3 for RGB, 1 for depth."""
+        return int(self.clips[0].frames.shape[3])
+
     def __len__(self) -> int:
         return int(self.ends[-1])
 
     def batch(self, *, seed: int, step: int, size: int) -> tuple[U8, Bool]:
-        """Images uint8 [B,h,w,3], drawn uniformly with replacement, and which of their pixels move, bool [B,h,w]."""
+        """Images uint8 [B,h,w,C], drawn uniformly with replacement, and which of their pixels move, bool [B,h,w]."""
         random = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, step]))
         pairs = [self._draw(int(index), random) for index in random.integers(len(self), size=size)]
         return np.stack([frame for frame, _ in pairs]), np.stack([moving for _, moving in pairs])

@@ -60,7 +60,8 @@ class LowLevelPolicy(nn.Module):
             self.seen[view] = QuantisedLatents(contract.latent_shapes[view][0], codes, moments)
 
         def eyes() -> dict[str, ResNet18]:
-            channels = {view: contract.latent_shapes[view][0] if latents else 3 for view in self.views}
+            sizes = contract.latent_shapes
+            channels = {v: sizes[v][0] if latents else contract.image_channels(v) for v in self.views}
             return {v: ResNet18(recipe.vision_width, n, recipe.pool, latents=latents) for v, n in channels.items()}
 
         nets = eyes()

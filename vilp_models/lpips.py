@@ -32,7 +32,7 @@ MIN_SIDE: dict[LpipsNetwork, int] = {"alex": 31, "vgg": 16}
 
 
 class Lpips(nn.Module):
-    """Distance d [B] >= 0 between two batches [B,3,H,W] of RGB images in [-1, 1]; 0 for equal images.
+    """Distance d [B] >= 0 between two batches [B,3,H,W] of RGB images in [-1, 1], or [B,1,H,W] of grey ones; 0 for equal images.
 
     The weights are frozen; gradients flow to both images. Fill them with `load_lpips`.
     """
@@ -66,7 +66,7 @@ class Lpips(nn.Module):
 
     def features(self, x_BCHW: Tensor) -> list[Tensor]:
         """Activations after the last ReLU of every stage, finest first."""
-        x = (x_BCHW - self.shift) / self.scale
+        x = (x_BCHW - self.shift) / self.scale  # one channel is taken as grey: the constants have three
         taps, convs = [], iter(self.convs)
         for layer in self.layers:
             if layer == "tap":

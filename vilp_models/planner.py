@@ -182,14 +182,16 @@ class Context(nn.Module):
         super().__init__()
         self.views = contract.views
         self.several = recipe.condition.startswith("tokens")
-        nets = {view: ResNet18(recipe.vision_width, grid=self.several) for view in self.views}
+        nets = {v: ResNet18(recipe.vision_width, contract.image_channels(v), grid=self.several) for v in self.views}
         self.vision = nn.ModuleDict(nets)
         self.low_dim = Normaliser(contract.normaliser["low_dim"]) if low_dim else None
         features = nets[self.views[0]].features
         if self.several:
             self.size = features
             # Which cell of which view a token is, the token itself must say.
-            cells = {view: _cells(contract.geometry[view], net) for view, net in nets.items()}
+            cells = {
+                view: _cells(contract.geometry[view], contract.image_channels(view), net) for view, net in nets.items()
+            }
             self.places = nn.ParameterDict({v: nn.Parameter(0.02 * torch.randn(n, features)) for v, n in cells.items()})
             self.lift = nn.Linear(contract.low_dim_size, features) if low_dim else None
         else:
@@ -207,9 +209,9 @@ class Context(nn.Module):
 
 
 @torch.no_grad()
-def _cells(geometry: tuple[int, int, str], vision: nn.Module) -> int:
+def _cells(geometry: tuple[int, int, str], channels: int, vision: nn.Module) -> int:
     height, width, _ = geometry
-    return int(vision(torch.zeros(1, 3, height, width)).shape[1])
+    return int(vision(torch.zeros(1, channels, height, width)).shape[1])
 
 
 def _check_sides(shape: tuple[int, int, int], *, halvings: int) -> None:

@@ -72,10 +72,12 @@ def train_vqgan(
     device: str | None = None,
     show: bool = True,
 ) -> list[RunState]:
-    """Train one VQGAN a view, or one for all views where the recipe shares it, on frames of `train_episodes` alone.
+    """Train one VQGAN a view, or where the recipe shares it one for all views of pictures and one for all of depth, on frames of
+    `train_episodes` alone.
 
     Returns where each run ended; see `_bring_to_end` for what is left alone and what is refused.
     """
+    _require_views(spec, dataset_dir)
     store = EpisodeStore(dataset_dir)
     entries = {entry.id: entry for entry in store.index()}
     for episode in train_episodes:
@@ -91,10 +93,22 @@ def train_vqgan(
 
         return Run("vqgan", views, run_folder(run_dir, views), recipe, trainee, unit="images")
 
-    groups = [tuple(sorted(spec.views))] if recipe.share_views else [(view,) for view in sorted(spec.views)]
+    groups = _sharing(spec) if recipe.share_views else [(view,) for view in sorted(spec.views)]
     runs = [run_of(views) for views in groups]
     processes = Processes(recipe.precision, device=device)
     return _bring_all_to_end(runs, episodes, split_hash, processes, restart=restart, show=show)
+
+
+def _require_views(spec: TaskSpec, dataset_dir: Path) -> None:
+    if not spec.views:
+        remedy = "record a camera, or train what needs none: `vilp-models train bc`"
+        raise UsageError("the dataset has no views, so there is nothing to imagine", where=dataset_dir, remedy=remedy)
+
+
+def _sharing(spec: TaskSpec) -> list[tuple[str, ...]]:
+    """The views that may share a VQGAN: those whose frames have equally many channels, pictures first."""
+    channels = {view: spec.views[view].channels for view in sorted(spec.views)}
+    return [tuple(view for view, c in channels.items() if c == n) for n in sorted(set(channels.values()), reverse=True)]
 
 
 def train_planner(
@@ -115,6 +129,7 @@ def train_planner(
     from vilp_models.planner import Planner
     from vilp_models.planner_clips import planner_clips
 
+    _require_views(spec, dataset_dir)
     episodes, split_hash = _training_side(dataset_dir)
     processes = Processes(recipe.precision, device=device)
     encoders = _encoders(dataset_dir, spec, vqgan, processes)
@@ -162,6 +177,7 @@ def train_policy(
     raises as `train_planner`."""
     from vilp_models.low_level import LowLevelPolicy
 
+    _require_views(spec, dataset_dir)
     episodes, split_hash = _training_side(dataset_dir, acting=True)
     processes = Processes(recipe.precision, device=device)
     encoders = {}

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from vilp_data.dataset_split import side_episodes
-from vilp_data.episodes import EpisodeStore
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
+from vilp_data.keys import ingest_key
 from vilp_data.spec import TaskSpec, WindowSpec
 from vilp_models.checkpoint import (
     FILE,
@@ -183,5 +184,16 @@ def _checked(
     # Another VQGAN may not have encoded these episodes, and then there are no latents to take statistics of.
     there.require_same(there.as_said_by(spec, latent_keys=keys), where=run, model=kind)
     known = [entry for entry in store.index() if entry.id in trained.state.train_episodes]
-    there.require_same(there.now(store.root, spec, known, latent_keys=keys), where=run, model=kind)
+    now = there.now(store.root, spec, known, latent_keys=keys)
+    if _some_were_taken_out(known, trained.state.train_episodes):
+        # What is left has other statistics, and the model keeps its own.
+        now = replace(now, normaliser=there.normaliser)
+    there.require_same(now, where=run, model=kind)
     return trained
+
+
+def _some_were_taken_out(known: Sequence[EpisodeEntry], learnt: Mapping[str, str]) -> bool:
+    """Whether training episodes (id -> key) were removed or trimmed since, and the others are those it was trained on."""
+    left = {entry.id: entry for entry in known}
+    same = all(entry.ingest_key == ingest_key(learnt[id]) for id, entry in left.items())
+    return same and any(id not in left or left[id].key != key for id, key in learnt.items())

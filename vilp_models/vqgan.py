@@ -28,10 +28,13 @@ LATENT_SCALING = 1.0
 """Latents are stored as the encoder gives them; whoever trains on them standardises with their statistics."""
 
 
-def build_vqgan(recipe: VqganRecipe) -> VQModel:
-    """An untrained VQGAN. Input and output are [B,3,H,W] in [-1, 1]; H and W are multiples of `recipe.downsampling`."""
+def build_vqgan(recipe: VqganRecipe, *, image_channels: int = 3) -> VQModel:
+    """An untrained VQGAN. Input and output are [B,C,H,W] in [-1, 1], C = `image_channels`: 3 for RGB, 1 for depth. H and W are
+    multiples of `recipe.downsampling`."""
     levels = len(recipe.channels)
     model = VQModel(
+        in_channels=image_channels,
+        out_channels=image_channels,
         down_block_types=("DownEncoderBlock2D",) * levels,
         up_block_types=("UpDecoderBlock2D",) * levels,
         block_out_channels=recipe.channels,
@@ -58,12 +61,12 @@ def check_divisible(height: int, width: int, downsampling: int) -> None:
 
 
 def to_signed(frames_BHWC: Tensor) -> Tensor:
-    """uint8 [B,H,W,3] to float32 [B,3,H,W] in [-1, 1]."""
+    """uint8 [B,H,W,C] to float32 [B,C,H,W] in [-1, 1]."""
     return frames_BHWC.permute(0, 3, 1, 2).float() / 127.5 - 1.0
 
 
 def to_frames(images_BCHW: Tensor) -> Tensor:
-    """[-1, 1] back to uint8 [B,H,W,3], rounded and clipped; the inverse of `to_signed`."""
+    """[-1, 1] back to uint8 [B,H,W,C], rounded and clipped; the inverse of `to_signed`."""
     return ((images_BCHW.float() + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
 
 
@@ -74,7 +77,7 @@ def nearest_codes(z_BCHW: Tensor, codebook_KC: Tensor) -> Tensor:
 
 
 class VqganEncoder:
-    """A trained VQGAN behind vilp_data's `FrameEncoder` protocol. Frames are RGB, top row first.
+    """A trained VQGAN behind vilp_data's `FrameEncoder` protocol. Frames are RGB, or the one channel of a depth view; top row first.
 
     On a CPU the bytes of latents depend on the batch size and on torch's thread count, which the caller keeps fixed.
     """
@@ -99,6 +102,11 @@ class VqganEncoder:
         return int(self.model.quantize.n_e)
 
     @property
+    def image_channels(self) -> int:
+        """Of the frames: 3 for RGB, 1 for depth."""
+        return int(self.model.config.in_channels)
+
+    @property
     def key(self) -> str:
         """16 hex digits: the digest of `key_fields`."""
         return digest(self.key_fields)[:16]
@@ -113,7 +121,9 @@ class VqganEncoder:
 
         The architecture is named beside the weights, since equal tensors compute other things in another one (groups)."""
         config = self.model.config
-        return {
+        # Only where it is another number than it used to be: latents of pictures keep the keys that they have.
+        depth = {} if self.image_channels == 3 else {"image_channels": str(self.image_channels)}
+        return depth | {
             "weights": encoder_digest(self.model),
             "channels": "-".join(map(str, config.block_out_channels)),
             "blocks": str(config.layers_per_block),
@@ -135,7 +145,7 @@ class VqganEncoder:
         return self.model.config.latent_channels, height // self.downsampling, width // self.downsampling
 
     def encode(self, frames: U8) -> F16:
-        """uint8 [B,H,W,3] to float16 [B,c,h,w], before quantisation."""
+        """uint8 [B,H,W,C] to float16 [B,c,h,w], before quantisation."""
         return self.encode_f32(frames, precision=self.precision).astype(np.float16)
 
     def encode_f32(self, frames: U8, *, precision: Precision = "f32") -> F32:
@@ -145,8 +155,14 @@ class VqganEncoder:
 
     @torch.inference_mode()
     def encode_tensor(self, frames_BHWC: Tensor, *, precision: Precision | None = None) -> Tensor:
-        """uint8 [B,H,W,3] on the encoder's device to float32 [B,c,h,w] there, before quantisation and rounding."""
+        """uint8 [B,H,W,C] on the encoder's device to float32 [B,c,h,w] there, before quantisation and rounding."""
         self.latent_shape(*frames_BHWC.shape[1:3])
+        if frames_BHWC.shape[3] != self.image_channels:
+            found = f"frames of {frames_BHWC.shape[3]} channels, a VQGAN of {self.image_channels}"
+            remedy = "train the view's VQGAN again: `vilp-models train vqgan --restart`"
+            raise UsageError(
+                "the view was given or lost its `depth` since this VQGAN was trained", found=found, remedy=remedy
+            )
         x = to_signed(frames_BHWC).contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=(precision or self.precision) == "bf16"):
             z: Tensor = self.model.encode(x).latents
@@ -159,13 +175,13 @@ class VqganEncoder:
         return nearest_codes(z, self.model.quantize.embedding.weight).cpu().numpy()
 
     def decode(self, latents: F16 | F32) -> U8:
-        """[B,c,h,w] before quantisation to uint8 [B,H,W,3]: quantised, then decoded."""
+        """[B,c,h,w] before quantisation to uint8 [B,H,W,C]: quantised, then decoded."""
         frames: U8 = self.decode_tensor(torch.tensor(latents, device=self.device)).cpu().numpy()
         return frames
 
     @torch.inference_mode()
     def decode_tensor(self, z_BCHW: Tensor) -> Tensor:
-        """`decode` on the encoder's device: latents of any float type to uint8 [B,H,W,3]. Under autocast codes are still chosen in
+        """`decode` on the encoder's device: latents of any float type to uint8 [B,H,W,C]. Under autocast codes are still chosen in
         float32, whose digits the distances need."""
         with torch.autocast(self.device.type, enabled=False):
             z_q: Tensor = self.model.quantize(z_BCHW.float())[0]
@@ -187,8 +203,9 @@ def encoder_digest(model: VQModel) -> str:
 def load_vqgan(run: Path) -> tuple[VQModel, VqganRecipe]:
     """The trained network in one run's folder, and its recipe. Raises StoreError where it is missing or damaged."""
     recipe = VqganRecipe.model_validate(read_recipe(run))
-    model = build_vqgan(recipe)
-    model.load_state_dict({name: torch.from_numpy(array) for name, array in model_tensors(run).items()})
+    tensors = model_tensors(run)
+    model = build_vqgan(recipe, image_channels=int(tensors["encoder.conv_in.weight"].shape[1]))
+    model.load_state_dict({name: torch.from_numpy(array) for name, array in tensors.items()})
     return model, recipe
 
 

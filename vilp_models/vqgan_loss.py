@@ -1,6 +1,6 @@
 """What a VQGAN is trained on: L1, LPIPS and an adaptive hinge PatchGAN (Esser et al. 2021, eqs. 5 to 7).
 
-All images are [B,3,H,W] in [-1, 1]; every loss is a scalar tensor.
+All images are [B,C,H,W] in [-1, 1], C 3 for RGB and 1 for depth; every loss is a scalar tensor.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ def weighted_l1(real_BCHW: Tensor, fake_BCHW: Tensor, moving_BHW: Tensor, moving
 class PatchDiscriminator(nn.Sequential):
     """Logits [B,1,h,w], one for each overlapping patch of the image (Isola et al. 2017): real high, fake low."""
 
-    def __init__(self, *, filters: int = 64, layers: int = 3) -> None:
-        blocks: list[nn.Module] = [nn.Conv2d(3, filters, 4, 2, 1), nn.LeakyReLU(0.2)]
+    def __init__(self, *, filters: int = 64, layers: int = 3, image_channels: int = 3) -> None:
+        blocks: list[nn.Module] = [nn.Conv2d(image_channels, filters, 4, 2, 1), nn.LeakyReLU(0.2)]
         channels = filters
         for i in range(1, layers + 1):
             out, stride = filters * min(2**i, 8), 2 if i < layers else 1

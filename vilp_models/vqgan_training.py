@@ -34,7 +34,7 @@ CLIP_FRAMES = 8
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A forward pass: images [B,3,H,W] in [-1, 1], latents before quantisation [B,c,h,w], the codes chosen or None."""
+    """A forward pass: images [B,C,H,W] in [-1, 1], latents before quantisation [B,c,h,w], the codes chosen or None."""
 
     fake: Tensor
     latents: Tensor
@@ -61,8 +61,12 @@ class VqganTraining:
             _check_size(recipe, height, width)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
-            self.model: VQModel = build_vqgan(recipe).to(self.device).train()
-            self.discriminator = PatchDiscriminator().to(self.device) if recipe.discriminator_weight > 0 else None
+            self.model: VQModel = build_vqgan(recipe, image_channels=frames.channels).to(self.device).train()
+            self.discriminator = (
+                PatchDiscriminator(image_channels=frames.channels).to(self.device)
+                if recipe.discriminator_weight > 0
+                else None
+            )
         self.perceptual = load_lpips(recipe.perceptual).to(self.device) if recipe.perceptual != "none" else None
         self.optimizers: dict[str, Optimizer] = {
             "generator": Adam(self.model.parameters(), recipe.learning_rate, recipe.betas)
@@ -179,7 +183,7 @@ class VqganTraining:
 
     @torch.no_grad()
     def clips(self) -> Mapping[str, U8]:
-        """Images of the first batch, each beside its reconstruction: uint8 [T,H,2W,3]."""
+        """Images of the first batch, each beside its reconstruction: uint8 [T,H,2W,C]."""
         real = self._batch(0)[0][:CLIP_FRAMES]
         fake = self._reconstruct(real, quantise=self._quantises).fake
         return {"real and reconstructed": to_frames(torch.cat([real, fake], dim=3)).cpu().numpy()}

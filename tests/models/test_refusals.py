@@ -17,6 +17,7 @@ from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import VilpDataError
 from vilp_data.latent_runs import encode_dataset
 from vilp_data.spec import TaskSpec, task_from_dict
+from vilp_data.surgery import plan_trim, remove_episodes, trim_episodes
 from vilp_models.trained import load_bc, load_low_level, load_planners
 from vilp_models.vqgan import load_frame_encoder
 
@@ -147,6 +148,20 @@ def today(trained_cards: TrainedCards) -> Today:
 @pytest.mark.parametrize("model", MODELS)
 def test_a_model_loads_where_nothing_changed(today: Today, model: str) -> None:
     assert today.load(model)
+
+
+def test_a_model_loads_where_episodes_it_learnt_from_were_removed_or_trimmed(today: Today, tmp_path: Path) -> None:
+    """It keeps its own statistics; what is left of the training episodes has others."""
+    copied = _copied(today, tmp_path)
+    root = copied.cards.root
+    gone, cut, *_ = read_split(root).ids("train")
+    remove_episodes(root, [gone])
+    trim_episodes(root, plan_trim(root, [cut], steps=(3, None)))
+    for model in MODELS:
+        assert copied.load(model)
+    another_split_of = another_split(copied, tmp_path / "split")
+    with pytest.raises(VilpDataError, match="was trained on"):
+        another_split_of.load("planner")
 
 
 @pytest.mark.parametrize(

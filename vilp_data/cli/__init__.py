@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from vilp_data.cli import datasets, logs, view
+from vilp_data.cli import check, datasets, export, history, logs, render, salvage, surgery, view
 from vilp_data.errors import VilpDataError
 
 INTERRUPTED = 130
@@ -21,12 +21,25 @@ app = typer.Typer(
 # The order of --help: the walk of an episode.
 for verb in (
     logs.record,
+    render.render,
     logs.inspect,
+    check.check,
+    salvage.salvage,
     logs.ingest,
     datasets.split,
     datasets.latents,
     datasets.why_stale,
     view.view,
+    export.export,
+    export.card,
+    surgery.remove,
+    surgery.trim,
+    surgery.relabel,
+    surgery.merge,
+    history.log,
+    history.diff,
+    history.undo,
+    history.gc,
 ):
     app.command(verb.__name__.replace("_", "-"))(verb)
 

@@ -9,12 +9,15 @@ from typing import Annotated
 
 import typer
 
+from vilp_data.cli.cuts import cuts_as_data, print_cuts
 from vilp_data.cli.options import JsonOption, PresetOption, TaskOption, WorkersOption, console, print_json, progress_bar
 from vilp_data.engine import cpu_count
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.locate import default_root, find_dataset, remember
 from vilp_data.spec import TaskSpec, load_task
+
+FULL_FAILURES = 3  # of the same kind, said in full
 
 
 def record(
@@ -59,20 +62,56 @@ def record(
 
 
 def inspect(
-    log: Annotated[Path, typer.Argument(help="An MCAP file or a zarr folder.", show_default=False)],
+    log: Annotated[Path, typer.Argument(help="A log: a file or a folder, whatever its format.", show_default=False)],
+    task: Annotated[
+        str | None,
+        typer.Option(help="Show the demonstrations that this task finds in the log as well.", show_default=False),
+    ] = None,
+    suggest_spec: Annotated[
+        bool, typer.Option("--suggest-spec", help="Write a task TOML for this log, with its reasons as comments.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Where --suggest-spec writes. Default: stdout.", show_default=False),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what is in a log: topics, types, rates, gaps, image sizes, clocks.
+    """Say what is in a log: topics, types, rates, gaps, image sizes, clocks; or suggest a task that reads it.
 
-    Example: vilp-data inspect episode.mcap
+    Example: vilp-data inspect episode.mcap --suggest-spec -o mytask.toml
     """
     from vilp_data.log_summary import format_summary, summarise
 
+    if suggest_spec:
+        _write_suggestion(log, out)
+        return
+    if out is not None:
+        raise UsageError("-o says where --suggest-spec writes", remedy="add --suggest-spec, or redirect the output")
     summary = summarise(log)
     if as_json:
-        print_json(dataclasses.asdict(summary))
-    else:
-        print(format_summary(summary))
+        shown = cuts_as_data([log], load_task(task)) if task is not None else {}
+        print_json(dataclasses.asdict(summary) | shown)
+        return
+    print(format_summary(summary))
+    if task is not None:
+        print()
+        print_cuts([log], load_task(task), as_json=False)
+
+
+def _write_suggestion(log: Path, out: Path | None) -> None:
+    from vilp_data.suggest_spec import suggest_spec
+
+    if out is not None and out.exists():
+        raise UsageError("it exists already", where=out, remedy="name another file, or delete it")
+    text = suggest_spec(log, name=None if out is None else out.stem)
+    if out is None:
+        print(text, end="")
+        return
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError("cannot be written", where=out, found=error.strerror, remedy="check the folder") from error
+    print(f"{out}: a task for {log}; read its comments, then `vilp-data ingest {log} --task {out}`")
 
 
 def ingest(
@@ -87,6 +126,10 @@ def ingest(
     with_rollouts: Annotated[
         bool,
         typer.Option("--with-rollouts", help="Store a policy's own episodes too: they never get a side of the split."),
+    ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Take episodes that were removed on purpose as well.")] = False,
+    show: Annotated[
+        bool, typer.Option("--preview", help="Print the demonstrations in the logs, and write nothing.")
     ] = False,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
@@ -103,10 +146,14 @@ def ingest(
     else:
         root, spec = _dataset_and_its_spec(into)
         console.print(f"dataset: {root}, its task {spec.name}", highlight=False)
+    if show:
+        if not print_cuts(logs, spec, as_json=as_json):
+            raise typer.Exit(1)
+        return
     with progress_bar(f"ingesting into {root}", None) as advance:
         report = ingest_logs(
             logs, root, spec, workers=workers or cpu_count(), include_failures=include_failures,
-            with_rollouts=with_rollouts, progress=advance,
+            with_rollouts=with_rollouts, again=again, progress=advance,
         )  # fmt: skip
     remember(root)
     if as_json:
@@ -120,6 +167,10 @@ def ingest(
         if report.rollouts:
             many = "1 rollout" if len(report.rollouts) == 1 else f"{len(report.rollouts)} rollouts"
             print(f"  {many} of a policy left out; --with-rollouts stores what no model will learn from")
+        if report.removed:
+            stay = "1 episode was" if len(report.removed) == 1 else f"{len(report.removed)} episodes were"
+            listed = ", ".join(report.removed[:5]) + (", …" if len(report.removed) > 5 else "")
+            print(f"  {stay} removed on purpose before, and left out: {listed}; --again takes them")
         if report.replaced:
             print(f"  replaced, since their log changed: {', '.join(report.replaced)}")
         if report.passed_over:
@@ -129,10 +180,24 @@ def ingest(
         for episode, findings in sorted(report.findings.items()):
             for finding in findings:
                 print(f"  {episode}: {finding}")
-        for name, message in report.failed:
-            print(f"  {name}: {message}", file=sys.stderr)
+        for line in _failures(report.failed):
+            print(line, file=sys.stderr)
     if report.failed:
         raise typer.Exit(1)
+
+
+def _failures(failed: list[tuple[str, str]]) -> list[str]:
+    """Every failure in full; of more than FULL_FAILURES that end in the same words, the first ones and the others' names: a dataset
+    that was fetched in part lacks files by the hundred."""
+    alike: dict[str, list[tuple[str, str]]] = {}
+    for name, message in failed:
+        alike.setdefault(message.partition("\n")[0].rpartition(": ")[2], []).append((name, message))
+    lines = []
+    for what, group in alike.items():
+        lines += [f"  {name}: {message}" for name, message in group[:FULL_FAILURES]]
+        if rest := [name for name, _ in group[FULL_FAILURES:]]:
+            lines.append(f"  {len(rest)} more, {what} (--json has all): {', '.join(rest)}")
+    return lines
 
 
 def _dataset_and_its_spec(given: Path | None) -> tuple[Path, TaskSpec]:

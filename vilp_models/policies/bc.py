@@ -27,7 +27,8 @@ class BcNetwork(nn.Module):
         """`n_action_steps` (paper N_e) actions t, t + 1, … are learnt from an observation at step t."""
         super().__init__()
         self.views, self.n_action_steps, self.action_size = contract.views, n_action_steps, contract.action_size
-        nets = {view: ResNet18(recipe.vision_width, pool=recipe.pool) for view in self.views}
+        channels = {view: contract.image_channels(view) for view in self.views}
+        nets = {view: ResNet18(recipe.vision_width, n, recipe.pool) for view, n in channels.items()}
         self.vision = nn.ModuleDict(nets)
         features = sum(net.features for net in nets.values())
         self.low_dim = None
