@@ -41,7 +41,7 @@ def test_a_preset_alone_is_that_of_the_built_in_task_that_was_ingested(data: Pat
     _, spec = dataset_of(data / "pusht", None, "cpu")
     today = load_task("pusht", preset="cpu")
     assert (spec.window, spec.models, spec.sim) == (today.window, today.models, today.sim)
-    assert spec.window.n_plan_frames == 6
+    assert spec.window.n_plan_frames == 4
     assert spec.models["vqgan"]["steps"] == 7000
     assert dataset_of(data / "pusht", None, None)[1].window.n_plan_frames == 12
 
