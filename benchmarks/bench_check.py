@@ -28,8 +28,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from tests.synthetic import START_NS, card_frame, encode_image, write_mcap
-from vilp_data.check_log import check_log
-from vilp_data.check_sources import check_sources
+from vilp_data.check.log import check_log
+from vilp_data.check.sources import check_sources
 from vilp_data.types import U8
 
 REPEATS = 5

@@ -7,9 +7,9 @@ from pathlib import Path
 from tests.stored_episodes import episode, write_dataset, write_latents
 from vilp_data.dataset_split import update_split
 from vilp_data.episodes import EpisodeStore, Origin
-from vilp_data.merge import merge_datasets
-from vilp_data.surgery import plan_trim, relabel_episodes, remove_episodes, trim_episodes
-from vilp_data.undo import undo
+from vilp_data.surgery.merge import merge_datasets
+from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
+from vilp_data.surgery.undo import undo
 
 
 def split(root: Path, *, seed: int = 0, redraw: bool = False) -> None:

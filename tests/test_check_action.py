@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.faulty_logs import robot
 from tests.pusht_human import human_episode
-from vilp_data.check_action import SHIFTS, Stretch, action_findings, fit_action
+from vilp_data.check.action import SHIFTS, Stretch, action_findings, fit_action
 
 
 def stretches(shift: int, *, seed: int = 0, n: int = 200, episodes: int = 2, follow: float = 0.6) -> list[Stretch]:

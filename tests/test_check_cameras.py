@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.synthetic import card_frame, colour_card, encode_image, psnr
 from tests.video_packets import GROUP, encode, numbered_frames, video_message
-from vilp_data.check import Finding
-from vilp_data.check_cameras import COMPARED, FROZEN_S, Glance, camera_findings, glance, thumbnails_of
-from vilp_data.check_pictures import PictureReader, is_camera
+from vilp_data.check.cameras import COMPARED, FROZEN_S, Glance, camera_findings, glance, thumbnails_of
+from vilp_data.check.findings import Finding
+from vilp_data.check.pictures import PictureReader, is_camera
 from vilp_data.types import Message
 
 

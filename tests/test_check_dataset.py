@@ -9,8 +9,8 @@ import numpy as np
 
 from tests.faulty_logs import robot
 from tests.stored_episodes import add_episodes
-from vilp_data.check import Finding
-from vilp_data.check_sources import check_sources
+from vilp_data.check.findings import Finding
+from vilp_data.check.sources import check_sources
 from vilp_data.dataset_split import update_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.spec import task_from_dict

@@ -10,10 +10,10 @@ import pytest
 from tests.faulty_logs import CAMERA, write_faulty
 from tests.real_data import real_data
 from tests.synthetic import ACTION_TOPIC, JOINT_TOPIC, Encoding, write_mcap, write_zarr
-from vilp_data.check import Finding
-from vilp_data.check_log import check_log
-from vilp_data.check_report import BINS
-from vilp_data.check_sources import check_sources
+from vilp_data.check.findings import Finding
+from vilp_data.check.log import check_log
+from vilp_data.check.report import BINS
+from vilp_data.check.sources import check_sources
 from vilp_data.errors import UsageError
 from vilp_data.spec import TaskSpec, load_task
 
@@ -148,8 +148,8 @@ def test_a_path_without_a_log_is_wrong_use(tmp_path: Path) -> None:
 
 
 def test_what_is_kept_does_not_grow_with_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vilp_data.check_log.STRETCH_NUMBERS", 2000)
-    monkeypatch.setattr("vilp_data.check_log.LOOK_EVERY", 100)
+    monkeypatch.setattr("vilp_data.check.log.STRETCH_NUMBERS", 2000)
+    monkeypatch.setattr("vilp_data.check.log.LOOK_EVERY", 100)
     path = write_faulty(tmp_path / "long.mcap", duration_s=40, gap=(20.0, 22.0), nan=(30.0, 31.0))
     report = check_sources([path])
     assert sorted({f.kind for f in report.findings}) == ["gap", "nan"]

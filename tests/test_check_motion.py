@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vilp_data.check import Finding
-from vilp_data.check_motion import (
+from vilp_data.check.findings import Finding
+from vilp_data.check.motion import (
     IDLE_S,
     Series,
     idle_ends,

@@ -11,10 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.faulty_logs import write_faulty
-from vilp_data.check import Finding, Place, grouped, verdict, worst_first
-from vilp_data.check_page import page
-from vilp_data.check_sources import check_sources
-from vilp_data.check_text import format_report
+from vilp_data.check.findings import Finding, Place, grouped, verdict, worst_first
+from vilp_data.check.page import page
+from vilp_data.check.sources import check_sources
+from vilp_data.check.text import format_report
 from vilp_data.cli import app
 
 VOID = {"meta", "img", "br", "line", "rect", "polygon", "polyline", "link"}

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vilp_data.check import Finding
-from vilp_data.check_timing import (
+from vilp_data.check.findings import Finding
+from vilp_data.check.timing import (
     GAP_FACTOR,
     GAP_FLOOR_S,
     drift_findings,

@@ -15,7 +15,7 @@ from vilp_data.dataset_card import SHEET_EPISODES, make_card, write_card
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.spec import task_from_dict
-from vilp_data.surgery import plan_trim, relabel_episodes, trim_episodes
+from vilp_data.surgery.operations import plan_trim, relabel_episodes, trim_episodes
 
 
 def section(text: str, title: str) -> str:

@@ -16,11 +16,11 @@ from hypothesis.extra import numpy as hnp
 
 from tests.synthetic import colour_card, encode_image
 from vilp_data import limits
-from vilp_data.decode_depth import decode_depth, depth_levels, is_depth, level_metres
-from vilp_data.decode_images import decode_image
+from vilp_data.decode.depth import decode_depth, depth_levels, is_depth, level_metres
+from vilp_data.decode.images import decode_image
+from vilp_data.decode.rvl import unpack_rvl
 from vilp_data.errors import DecodeError, UsageError
 from vilp_data.geometry import fit_depth
-from vilp_data.rvl import unpack_rvl
 from vilp_data.spec import DepthSpec
 from vilp_data.types import Message
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.synthetic import colour_card
-from vilp_data.decode_images import CHANNELS, decode_image
+from vilp_data.decode.images import CHANNELS, decode_image
 from vilp_data.errors import DecodeError
 from vilp_data.types import U8, Message
 

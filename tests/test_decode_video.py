@@ -12,7 +12,7 @@ from av.video.reformatter import ColorRange, Colorspace
 
 from tests.synthetic import colour_card
 from tests.video_packets import ENCODERS, GROUP, Encoded, encode, number_of, numbered_frames, video_message
-from vilp_data.decode_video import BEFORE_KEYFRAME, RgbReader, VideoDecoder, is_video, packet_of, video_codec
+from vilp_data.decode.video import BEFORE_KEYFRAME, RgbReader, VideoDecoder, is_video, packet_of, video_codec
 from vilp_data.errors import DecodeError
 from vilp_data.types import U8, Message
 

@@ -14,19 +14,20 @@ from tests.faults import run_until_killed, tree
 from tests.stored_episodes import KEYS, VIEWS, episode, write_dataset
 from tests.surgery_operations import operate, other_dataset, split
 from tests.synthetic import task_spec, write_mcap, write_zarr, zarr_task_spec
-from vilp_data import garbage, journal, shards
+from vilp_data import shards
 from vilp_data.dataset_split import find_split
-from vilp_data.dataset_state import DatasetState, read_state
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import StoreError, UsageError
-from vilp_data.garbage import collect_garbage
-from vilp_data.history import read_history, state_after
 from vilp_data.ingest import ingest_logs
 from vilp_data.latents import latents_path
-from vilp_data.merge import merge_datasets
-from vilp_data.state_diff import compare_states
-from vilp_data.surgery import plan_trim, relabel_episodes, remove_episodes, trim_episodes
-from vilp_data.undo import undo
+from vilp_data.surgery import garbage, journal
+from vilp_data.surgery.dataset_state import DatasetState, read_state
+from vilp_data.surgery.garbage import collect_garbage
+from vilp_data.surgery.history import read_history, state_after
+from vilp_data.surgery.merge import merge_datasets
+from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
+from vilp_data.surgery.state_diff import compare_states
+from vilp_data.surgery.undo import undo
 
 
 @pytest.fixture

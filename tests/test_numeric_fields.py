@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.synthetic import STORE
-from vilp_data.message_body import member_names, set_members
-from vilp_data.numeric_fields import LARGEST_VECTOR, numeric_series
+from vilp_data.decode.message_body import member_names, set_members
+from vilp_data.decode.numeric_fields import LARGEST_VECTOR, numeric_series
 from vilp_data.types import Message
 
 NAMES = st.text("abcxyz", min_size=1, max_size=3)

@@ -21,15 +21,15 @@ from vilp_data.dataset_split import check_dataset_split, find_split, update_spli
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, UsageError
-from vilp_data.idle import moving_range
 from vilp_data.ingest import IngestReport, ingest_logs
 from vilp_data.latents import latents_path, open_latents, read_latents
 from vilp_data.pairs import PairDataset
-from vilp_data.removed import read_removed
 from vilp_data.spec import TaskSpec, WindowSpec
-from vilp_data.surgery import parse_steps, plan_trim, relabel_episodes, remove_episodes, trim_episodes
+from vilp_data.surgery.idle import moving_range
+from vilp_data.surgery.operations import parse_steps, plan_trim, relabel_episodes, remove_episodes, trim_episodes
+from vilp_data.surgery.removed import read_removed
+from vilp_data.surgery.undo import undo
 from vilp_data.types import Episode
-from vilp_data.undo import undo
 
 
 def moving(name: str, *, idle: int, moves: int, after: int) -> Episode:

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from tests.stored_episodes import add_episodes, episode, write_dataset
 from tests.surgery_operations import other_dataset
 from vilp_data.cli import main
-from vilp_data.dataset_state import DatasetState, EpisodeState
-from vilp_data.edits import edited, edits_of, relabelled, trimmed
 from vilp_data.episode_entry import EpisodeEntry
 from vilp_data.episodes import EpisodeStore
-from vilp_data.state_diff import compare_states
+from vilp_data.surgery.dataset_state import DatasetState, EpisodeState
+from vilp_data.surgery.edits import edited, edits_of, relabelled, trimmed
+from vilp_data.surgery.state_diff import compare_states
 
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "surgery.md"
 

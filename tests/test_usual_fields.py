@@ -11,10 +11,10 @@ from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from rosbags.typesys import Stores, get_typestore
 
-from vilp_data.decode_vectors import concerns, decode_vector
+from vilp_data.decode.usual_fields import usual_fields
+from vilp_data.decode.vectors import concerns, decode_vector
 from vilp_data.errors import DecodeError
 from vilp_data.types import Message
-from vilp_data.usual_fields import usual_fields
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 N_ELEMENTS = 3

@@ -37,7 +37,7 @@ from tests.synthetic import (
 )
 from tests.video_logs import write_video
 from tests.video_packets import GROUP, encode, number_of, numbered_frames
-from vilp_data import shards, viewer, viewer_canvas, viewer_process, viewer_window
+from vilp_data import shards, viewer
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import LogError, StoreError, UsageError
 from vilp_data.keys import FORMAT_VERSION
@@ -45,6 +45,9 @@ from vilp_data.latents import latents_path
 from vilp_data.plots import panel_rank
 from vilp_data.spec import TaskSpec
 from vilp_data.types import F16, U8, Episode
+from vilp_data.viewer import canvas as viewer_canvas
+from vilp_data.viewer import process as viewer_process
+from vilp_data.viewer import window as viewer_window
 
 EPISODE = "one"
 SAME_CARD_DB = 30.0  # JPEG at quality 95 stays above; a swapped channel, a flip and the next frame stay below
@@ -443,7 +446,8 @@ def listening(process: psutil.Process) -> list[str]:
 SERVE = """
 import sys
 from pathlib import Path
-from vilp_data import viewer, viewer_window
+from vilp_data import viewer
+from vilp_data.viewer import window as viewer_window
 drawn = viewer.Drawn(Path(sys.argv[1]), "", {})
 viewer_window.serve_web(drawn, on_url=lambda url: print(url, flush=True), web_port=0, data_port=0)
 """

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from vilp_data import align
+from vilp_data.decode.video_start import packets_before
 from vilp_data.errors import AlignError, LogError, SpecError, nearest
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
 from vilp_data.transforms import ALWAYS_NS
 from vilp_data.types import F32, F64, I64, Bool, Episode, LogEpisode, LogReader, outcome_of
 from vilp_data.vector_tracks import Tracks, VectorTracks, age_name, in_time, moves_frames, stamp_ns
-from vilp_data.video_start import packets_before
 from vilp_data.view_frames import Seen, Ticks, ViewFrames
 
 HELD_LONG_S = 1.0

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from vilp_data.decode.field_paths import fields_here, follow
+from vilp_data.decode.message_body import member_names, set_members
 from vilp_data.demonstrations import Marker, Span, named, spans_between_gaps, spans_by_value, spans_of_rows
 from vilp_data.episodes_spec import EpisodesSpec
 from vilp_data.errors import DecodeError, LogError, nearest
-from vilp_data.field_paths import fields_here, follow
 from vilp_data.keys import digest
-from vilp_data.message_body import member_names, set_members
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import I64, LogEpisode, Message

@@ -12,14 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from vilp_data import history, shards
+from vilp_data import shards
 from vilp_data.duplicates import thumbnails
 from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError
-from vilp_data.removed import read_removed
 from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
 from vilp_data.split_lock import Side, SplitLock, assignment_hash
+from vilp_data.surgery import history
+from vilp_data.surgery.removed import read_removed
 from vilp_data.types import is_rollout
 
 

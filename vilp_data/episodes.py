@@ -12,12 +12,13 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vilp_data import journal, shards
-from vilp_data.edits import Arrays, Edits, content_hash, edited
+from vilp_data import shards
 from vilp_data.episode_entry import INDEX_SCHEMA, EpisodeEntry, Origin, entry_of, header_of, row_of
 from vilp_data.errors import StoreError, UsageError, nearest
 from vilp_data.keys import FORMAT_VERSION, content_digest
 from vilp_data.spec import TaskSpec, task_from_dict
+from vilp_data.surgery import journal
+from vilp_data.surgery.edits import Arrays, Edits, content_hash, edited
 from vilp_data.types import U8, Episode
 
 __all__ = ["EpisodeEntry", "EpisodeStore", "Origin"]

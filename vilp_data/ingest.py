@@ -13,13 +13,13 @@ from vilp_data.assemble import assemble_episode
 from vilp_data.engine import map_unordered
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import AlignError, DecodeError, LogError, SpecError, UsageError, VilpDataError
-from vilp_data.history import Recording, recording
 from vilp_data.ingest_plan import Plan, Planned, make_plan
 from vilp_data.log_files import find_logs
 from vilp_data.log_hashes import HashCache
-from vilp_data.removed import read_removed, removed_bytes, removed_path
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
+from vilp_data.surgery.history import Recording, recording
+from vilp_data.surgery.removed import read_removed, removed_bytes, removed_path
 from vilp_data.types import Episode, LogReader
 
 EPISODES_PER_JOB = 8

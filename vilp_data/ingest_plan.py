@@ -21,14 +21,14 @@ from pathlib import Path
 
 from vilp_data.cut_log import cut_log
 from vilp_data.demonstrations import CUT_TAG
-from vilp_data.edits import Edits, edits_of
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import DecodeError, LogError, SpecError, UsageError
 from vilp_data.keys import digest, episode_key, first_difference
 from vilp_data.log_hashes import HashCache
-from vilp_data.removed import Removed, read_removed
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
+from vilp_data.surgery.edits import Edits, edits_of
+from vilp_data.surgery.removed import Removed, read_removed
 from vilp_data.types import LogEpisode, is_rollout, outcome_of
 
 

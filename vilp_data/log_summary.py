@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_image, is_wall_clock
-from vilp_data.decode_depth import is_depth, measured_depth
-from vilp_data.decode_video import VideoDecoder, is_video, video_codec
+from vilp_data.decode.depth import is_depth, measured_depth
+from vilp_data.decode.video import VideoDecoder, is_video, video_codec
 from vilp_data.errors import VilpDataError
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.types import I64, Message, TopicInfo

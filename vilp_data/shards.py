@@ -195,7 +195,7 @@ def writer_lock(root: Path) -> Iterator[None]:
             raise BusyError(
                 "another process is writing this dataset", where=root, remedy="wait until it is done, or stop it"
             ) from error
-        from vilp_data import journal  # which is made of this module
+        from vilp_data.surgery import journal  # which is made of this module
 
         _remove_leftovers(root)
         journal.settle(root)

@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 
 from vilp_data.decode import decode_image, decode_vector, header_time_ns, image_encoding, is_image
-from vilp_data.decode_depth import is_depth, measured_depth
-from vilp_data.decode_vectors import published_names
-from vilp_data.decode_video import VideoDecoder, is_video, video_codec
+from vilp_data.decode.depth import is_depth, measured_depth
+from vilp_data.decode.numeric_fields import numeric_paths
+from vilp_data.decode.usual_fields import usual_fields
+from vilp_data.decode.vectors import published_names
+from vilp_data.decode.video import VideoDecoder, is_video, video_codec
 from vilp_data.errors import VilpDataError
-from vilp_data.numeric_fields import numeric_paths
 from vilp_data.transforms import links_of
 from vilp_data.types import Message
-from vilp_data.usual_fields import usual_fields
 
 Kind = Literal["camera", "state", "command", "other", "frames", "unused"]
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from vilp_data import align
 from vilp_data.decode import header_time_ns
+from vilp_data.decode.message_body import cannot_decode, first_member, member, member_names
 from vilp_data.errors import AlignError, DecodeError, nearest
-from vilp_data.message_body import cannot_decode, first_member, member, member_names
 from vilp_data.types import F64, I64, Clock, Message
 
 COLUMNS: dict[str, tuple[int, ...]] = {

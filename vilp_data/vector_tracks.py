@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from vilp_data import align, decode
-from vilp_data.decode_vectors import concerns, published_names
+from vilp_data.decode.vectors import concerns, published_names
 from vilp_data.errors import AlignError, DecodeError, LogError, nearest
 from vilp_data.spec import ActionSpec, TaskSpec, TopicSpec, VectorSpec
 from vilp_data.transforms import Link, links_of, pick_columns, resolve

@@ -16,8 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vilp_data import align, decode_depth, decode_video, geometry
-from vilp_data.decode_images import decode_image
+from vilp_data import align, geometry
+from vilp_data.decode import depth as decode_depth
+from vilp_data.decode import video as decode_video
+from vilp_data.decode.images import decode_image
 from vilp_data.errors import DecodeError, SpecError, UsageError
 from vilp_data.frame_spool import FrameSpool
 from vilp_data.spec import ViewSpec

@@ -20,7 +20,7 @@ from vilp_data.plots import frame_psnr
 from vilp_data.shards import write_atomic
 from vilp_data.spec import WindowSpec
 from vilp_data.types import F16, F32, F64, U8
-from vilp_data.viewer_canvas import draw_clip
+from vilp_data.viewer.canvas import draw_clip
 from vilp_models.contact_sheet import ERROR_GAIN, captioned, error_image, grid, stacked, to_png
 from vilp_models.imagined import Decoder, Imagination, decode_frames, read_recorded, recorded_starts, spread
 from vilp_models.video import write_mp4

@@ -17,7 +17,7 @@ from tests.synthetic import START_NS, card_frame
 from tests.video_logs import DEPTH, PERIOD_NS, Row, joints, spec_of, write_log
 from vilp_data import viewer
 from vilp_data.dataset_split import read_split
-from vilp_data.decode_depth import level_metres
+from vilp_data.decode.depth import level_metres
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.ingest import ingest_logs

@@ -17,7 +17,7 @@ from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import VilpDataError
 from vilp_data.latent_runs import encode_dataset
 from vilp_data.spec import TaskSpec, task_from_dict
-from vilp_data.surgery import plan_trim, remove_episodes, trim_episodes
+from vilp_data.surgery.operations import plan_trim, remove_episodes, trim_episodes
 from vilp_models.trained import load_bc, load_low_level, load_planners
 from vilp_models.vqgan import load_frame_encoder
 

@@ -20,13 +20,13 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2 import ReaderError as Rosbag2Error
 
 from tests.real_data import ROOT, real_data
+from vilp_data.decode.usual_fields import usual_fields
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import LogError
 from vilp_data.ingest import ingest_logs
 from vilp_data.log_summary import LogSummary, format_summary, summarise
 from vilp_data.sources import open_log
 from vilp_data.spec import parse_task
-from vilp_data.usual_fields import usual_fields
 
 SUFFIXES = (".mcap", ".bag", ".db3")
 METADATA_ALONE = (

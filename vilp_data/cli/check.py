@@ -38,10 +38,10 @@ def check(
 
     Example: vilp-data check bags/ --html check.html
     """
-    from vilp_data.check import counts
-    from vilp_data.check_page import write_page
-    from vilp_data.check_sources import check_sources
-    from vilp_data.check_text import format_report, json_report
+    from vilp_data.check.findings import counts
+    from vilp_data.check.page import write_page
+    from vilp_data.check.sources import check_sources
+    from vilp_data.check.text import format_report, json_report
 
     paths = targets or [open_dataset(None)[0]]
     spec = load_task(task) if task else None

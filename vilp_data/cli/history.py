@@ -11,11 +11,11 @@ from typing import Annotated
 import typer
 
 from vilp_data.cli.options import DatasetArgument, JsonOption, open_dataset, print_json
-from vilp_data.dataset_state import DatasetState, read_state
 from vilp_data.errors import UsageError
-from vilp_data.garbage import KEEP
 from vilp_data.locate import find_dataset, is_dataset
-from vilp_data.state_diff import StateDiff, compare_states
+from vilp_data.surgery.dataset_state import DatasetState, read_state
+from vilp_data.surgery.garbage import KEEP
+from vilp_data.surgery.state_diff import StateDiff, compare_states
 
 SHOWN = 12
 """Episodes listed one by one before the rest are counted."""
@@ -26,7 +26,7 @@ def log(dataset: DatasetArgument = None, as_json: JsonOption = False) -> None:
 
     Example: vilp-data log data/hanoi
     """
-    from vilp_data.history import read_history
+    from vilp_data.surgery.history import read_history
 
     root, _ = open_dataset(dataset)
     entries = read_history(root)
@@ -89,7 +89,7 @@ def undo(
 
     Example: vilp-data undo data/hanoi
     """
-    from vilp_data.undo import undo as take_back
+    from vilp_data.surgery.undo import undo as take_back
 
     root, _ = open_dataset(dataset)
     entry = take_back(root, operation)
@@ -117,7 +117,7 @@ def gc(
 
     Example: vilp-data gc --dry-run
     """
-    from vilp_data.garbage import collect_garbage, size_text
+    from vilp_data.surgery.garbage import collect_garbage, size_text
 
     root, _ = open_dataset(dataset)
     report = collect_garbage(root, keep=keep, runs=run or (), dry_run=dry_run)
@@ -141,8 +141,8 @@ def gc(
 
 def _state(given: str | None, data: Path | None, default: str) -> DatasetState:
     """The state that an argument of `diff` names."""
-    from vilp_data.history import numbers, state_after
-    from vilp_data.journal import await_settled
+    from vilp_data.surgery.history import numbers, state_after
+    from vilp_data.surgery.journal import await_settled
 
     if given is not None and not given.isdigit():
         if not is_dataset(Path(given)):

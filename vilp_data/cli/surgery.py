@@ -27,7 +27,7 @@ def remove(
 
     Example: vilp-data remove run3 run7 --reason "the gripper was open"
     """
-    from vilp_data.surgery import remove_episodes
+    from vilp_data.surgery.operations import remove_episodes
 
     root, _ = open_dataset(data)
     report = remove_episodes(root, episodes, reason=reason)
@@ -63,7 +63,7 @@ def trim(
 
     Example: vilp-data trim --dry-run
     """
-    from vilp_data.surgery import parse_steps, plan_trim, trim_episodes
+    from vilp_data.surgery.operations import parse_steps, plan_trim, trim_episodes
 
     if steps is not None and not episodes:
         raise UsageError("which episodes have these steps?", remedy="name them: vilp-data trim EPISODE… --steps 10:140")
@@ -111,7 +111,7 @@ def relabel(
 
     Example: vilp-data relabel run3 --set operator=anna --outcome failure
     """
-    from vilp_data.surgery import relabel_episodes
+    from vilp_data.surgery.operations import relabel_episodes
 
     root, _ = open_dataset(data)
     report = relabel_episodes(root, episodes, labels=_pairs(labels or [], outcome), unset=unset or ())
@@ -140,7 +140,7 @@ def merge(
 
     Example: vilp-data merge data/monday data/tuesday
     """
-    from vilp_data.merge import merge_datasets
+    from vilp_data.surgery.merge import merge_datasets
 
     root, _ = open_dataset(into)
     report = merge_datasets(other, root)

@@ -1,0 +1,135 @@
+"""Logs and datasets checked one by one, and then against each other: what only shows in company.
+
+Actions are judged over all demonstrations of the same topics together, and demonstrations that look alike are named.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from vilp_data.check.action import Stretch, action_findings, fit_action
+from vilp_data.check.dataset import check_dataset
+from vilp_data.check.findings import Finding, Place, worst_first
+from vilp_data.check.log import check_log
+from vilp_data.check.report import Checked, Fit, Steps
+from vilp_data.duplicates import near_duplicates
+from vilp_data.engine import map_unordered
+from vilp_data.locate import is_dataset
+from vilp_data.log_files import find_logs
+from vilp_data.spec import TaskSpec
+
+BETWEEN = "\x1f"  # between a source and a demonstration in a name: in no path
+
+
+SAME_DISTANCE = 0.1
+"""Grey levels (of 255) between pictures of one recording under two names; runs of one script in one scene lie further apart."""
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """Everything that was checked, in the order given; `together`: findings about several of them; `fits` of their actions."""
+
+    checked: tuple[Checked, ...]
+    together: tuple[Finding, ...]
+    fits: tuple[Fit, ...]
+
+    @property
+    def folder(self) -> str:
+        """What all sources begin with, for showing them shorter: `bags/`; empty where there is nothing in common, or one source."""
+        parents = {str(Path(checked.source).parent) for checked in self.checked}
+        return f"{parents.pop()}/" if len(parents) == 1 and len(self.checked) > 1 else ""
+
+    @property
+    def findings(self) -> list[Finding]:
+        """All of them, worst first."""
+        return worst_first([*self.together, *(finding for one in self.checked for finding in one.findings)])
+
+
+def check_sources(
+    paths: Sequence[Path],
+    *,
+    spec: TaskSpec | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> CheckReport:
+    """Check logs, folders of logs and datasets. `spec` is for the logs; a dataset has its own. UsageError for a path without any.
+    `progress(done, total)` counts logs and datasets."""
+    todo = list(_todo(paths))
+    results: dict[Path, Checked] = {}
+    check = partial(_check_one, spec=spec)
+    with closing(map_unordered(check, todo, workers=workers if len(todo) > 1 else 1)) as finished:
+        for path, result in finished:
+            results[path] = result
+            if progress is not None:
+                progress(len(results), len(todo))
+    checked = tuple(results[path] for path in todo)
+    fits, found = _actions(checked)
+    return CheckReport(checked, (*found, *_look_alike(checked)), tuple(fits))
+
+
+def _todo(paths: Sequence[Path]) -> Iterator[Path]:
+    logs = [path for path in paths if not is_dataset(path)]
+    found = find_logs(logs) if logs else None
+    yield from dict.fromkeys([path for path in paths if is_dataset(path)])
+    if found is not None:
+        yield from [*found.logs, *found.passed_over]
+
+
+def _check_one(path: Path, spec: TaskSpec | None) -> Checked:
+    return check_dataset(path) if is_dataset(path) else check_log(path, spec=spec)
+
+
+# --- against each other -------------------------------------------------------------------------------------------------
+
+
+def _actions(checked: Sequence[Checked]) -> tuple[list[Fit], list[Finding]]:
+    """Actions judged over every demonstration with the same topics."""
+    groups: dict[tuple[str, bool, int, int], list[tuple[str, Steps]]] = defaultdict(list)
+    for one in checked:
+        if one.steps is not None:
+            groups[one.steps.shape].append((one.source, one.steps))
+    fits: list[Fit] = []
+    findings: list[Finding] = []
+    for (topic, certain, _, _), members in groups.items():
+        stretches = [
+            Stretch(f"{source}{BETWEEN}{stretch.name}", stretch.state, stretch.action, stretch.valid)
+            for source, steps in members
+            for stretch in steps.stretches
+        ]
+        fit = fit_action(stretches)
+        if fit is None:
+            continue
+        rate_hz = members[0][1].rate_hz
+        where = members[0][0] if len(members) == 1 else f"{len(members)} logs"
+        fits.append(Fit(topic if len(members) == 1 else f"{topic} ({where})", fit, rate_hz))
+        for finding in action_findings(fit, topic=topic, rate_hz=rate_hz, certain=certain):
+            source, _, episode = (finding.place.episode or where).partition(BETWEEN)
+            place = Place(source=source, topic=topic, episode=episode or None)
+            findings.append(replace(finding, place=place))
+    return fits, findings
+
+
+def _look_alike(checked: Sequence[Checked]) -> Iterator[Finding]:
+    """Pairs of demonstrations whose first, middle and last pictures are nearly the same."""
+    thumbnails = {
+        f"{one.source}{BETWEEN}{name}": small
+        for one in checked
+        if one.kind == "log"
+        for name, small in one.thumbnails.items()
+    }
+    several = {one.source: len(one.thumbnails) > 1 for one in checked}
+    for pair in near_duplicates(thumbnails):
+        (source, _, episode), (other, _, twin) = pair.first.partition(BETWEEN), pair.second.partition(BETWEEN)
+        named = twin if other == source else f"{other}, {twin}" if several[other] else other
+        yield Finding(
+            severity="warning" if pair.distance <= SAME_DISTANCE else "note", kind="near-duplicate",
+            place=Place(source=source, episode=episode if several[source] else None),
+            what=f"looks nearly like {named}",
+            evidence={"distance_grey_levels": pair.distance},
+            remedy="keep one of them: a copy in the validation set would be judged by what was trained on",
+        )  # fmt: skip

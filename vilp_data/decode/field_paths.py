@@ -1,0 +1,108 @@
+"""Paths into a message: "pose.position.x", "position[0:7]", "joints[2].effort", "[0:2]" for a bare array. Pure.
+
+A path may begin with `msg.`, as message definitions and plotting tools have it: "msg.position[0:7]" is "position[0:7]".
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from vilp_data.decode.message_body import cannot_decode, member_names, require_member
+from vilp_data.decode.numeric_fields import numeric_paths
+from vilp_data.decode.usual_fields import usual_fields
+from vilp_data.errors import DecodeError, nearest
+from vilp_data.types import Message
+
+_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)(?::(\d+))?\]")
+WHOLE = "msg"
+SHOWN_PATHS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    name: str
+
+
+Step = Member | int | slice
+
+
+@lru_cache(maxsize=1024)
+def parse_path(path: str) -> tuple[Step, ...]:
+    """The steps of a path. DecodeError where it is malformed."""
+    steps: list[Step] = []
+    position = 0
+    while position < len(path):
+        match = _STEP.match(path, position)
+        if (
+            match is None
+            or (match.group().startswith(".") and not steps)
+            or (match.group(1) and steps and not match.group().startswith("."))
+        ):
+            remedy = 'paths look like "pose.position.x", "position[0:7]", "[0:2]"'
+            raise DecodeError(f"field path {path!r} cannot be understood", found=path[position:], remedy=remedy)
+        name, first, stop = match.groups()
+        steps.append(Member(name) if name else int(first) if stop is None else slice(int(first), int(stop)))
+        position = match.end()
+    return tuple(steps)
+
+
+def follow(message: Message, path: str) -> Any:
+    """What lies at `path` in a message. DecodeError where the path leads nowhere: it says what is there."""
+    value, steps = message.body, parse_path(path)
+    if steps and steps[0] == Member(WHOLE) and WHOLE not in member_names(value):
+        steps = steps[1:]
+    if steps and not isinstance(steps[0], Member) and not isinstance(value, np.ndarray):
+        value = _bare_array(message)
+    for step in steps:
+        if isinstance(step, Member):
+            try:
+                value = require_member(value, step.name)
+            except (AttributeError, KeyError):
+                raise _no_member(message, path, step.name, value) from None
+        else:
+            value = _item(message, path, value, step)
+    return value
+
+
+def fields_here(message: Message) -> str:
+    """The numeric fields of a message, to be shown to whoever named none, or a wrong one."""
+    paths = numeric_paths(message.body)
+    shown = ", ".join(paths[:SHOWN_PATHS]) + (
+        f" and {len(paths) - SHOWN_PATHS} more" if len(paths) > SHOWN_PATHS else ""
+    )
+    return shown or "(no numbers)"
+
+
+def _no_member(message: Message, path: str, name: str, value: Any) -> DecodeError:
+    known = member_names(value)
+    if not known and isinstance(value, list | tuple) and value:
+        known = member_names(value[0])
+    remedy = f"{nearest(name, known)}; fields that hold numbers here: {fields_here(message)}"
+    return cannot_decode(message, f"field {path!r}: no {name!r}", None, remedy)
+
+
+def _bare_array(message: Message) -> Any:
+    """What "[0:2]" indexes in a message that is no array: the only field that its schema's vector is made of, as of the std_msgs
+    arrays; else the message itself, which has no items."""
+    fields = usual_fields(message.schema) or ()
+    return follow(message, fields[0]) if len(fields) == 1 else message.body
+
+
+def _item(message: Message, path: str, value: Any, step: int | slice) -> Any:
+    if isinstance(value, dict) or not hasattr(value, "__len__"):
+        found = type(value).__name__
+        raise cannot_decode(
+            message, f"field {path!r}: only lists and arrays have items", found, "leave the brackets out"
+        )
+    length = len(value)
+    last = step.stop if isinstance(step, slice) else step + 1
+    if last > length or (isinstance(step, slice) and step.start >= step.stop):
+        raise cannot_decode(
+            message, f"field {path!r} reaches outside its list", f"{length} values", f"use indices within [0:{length}]"
+        )
+    return value[step]

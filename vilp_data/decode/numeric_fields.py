@@ -1,0 +1,121 @@
+"""The numbers inside a message of any schema, found by walking it: what a viewer can plot without being told anything. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from vilp_data.decode.message_body import member_names, set_members
+from vilp_data.decode.usual_fields import PARTS_OF
+from vilp_data.types import Message
+
+LARGEST_VECTOR = 32
+"""Longer arrays are images, scans or matrices rather than something to plot."""
+
+MAX_DEPTH = 8
+STAMPS = frozenset({"header", "timestamp", "stamp"})
+ITEM_NAMES = ("name", "child_frame_id", "id")
+
+Series = dict[str, dict[str, float]]
+"""Group -> name of the series -> value: {"position": {"elbow": 0.1}}, {"pose.position": {"x": 0.3, "y": …}}."""
+
+
+def numeric_series(message: Message) -> Series:
+    """Every number in a message, grouped into what belongs in one plot. Header stamps and text are left out.
+
+    An array of at most LARGEST_VECTOR values is a group, its series named by the message's parallel `name` list if that has the
+    same length, else by index. Lists of messages (foxglove.JointStates, transforms) name their items by their own name."""
+    series: Series = {}
+    for path, value in _leaves(message.body, ()):
+        group, name = ".".join(path[:-1]), path[-1]
+        series.setdefault(group, {})[name] = value
+    return series
+
+
+def numeric_paths(body: Any) -> list[str]:
+    """Every path at which a message holds numbers, as a task's `fields` would name it: `position[0:7]` for a list, `pose.position`
+    for a point, `speed` for a number. Header stamps are left out, and so are lists of messages past their first item."""
+    if isinstance(body, np.ndarray | np.generic):
+        return [f"[0:{len(np.asarray(body))}]"] if body.ndim and body.dtype.kind in "fiub" else []
+    return list(_paths(body, "", 0))
+
+
+def _paths(value: Any, path: str, depth: int) -> Iterator[str]:
+    if depth > MAX_DEPTH:
+        return
+    if isinstance(value, bool | int | float | np.number | np.bool_):
+        yield path
+    elif isinstance(value, np.ndarray) or _is_list(value):
+        if len(value) and (
+            value.dtype.kind in "fiub" if isinstance(value, np.ndarray) else _numbers(value) is not None
+        ):
+            yield f"{path}[0:{len(value)}]"
+        elif len(value) and not isinstance(value, np.ndarray):
+            yield from _paths(value[0], f"{path}[0]", depth + 1)
+    else:
+        names = member_names(value)
+        if path and frozenset(names) in PARTS_OF:
+            yield path
+            return
+        for name, inside in set_members(value):
+            if name not in STAMPS:
+                yield from _paths(inside, f"{path}.{name}" if path else name, depth + 1)
+
+
+def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
+    if len(path) > MAX_DEPTH:
+        return
+    if isinstance(value, bool | int | float | np.number | np.bool_):
+        yield path or ("value",), float(value)
+    elif isinstance(value, np.ndarray) or _is_list(value):
+        yield from _list_leaves(value, path, ())
+    else:
+        fields = dict(set_members(value))
+        names = _texts(fields.get("name"))
+        for name, inside in fields.items():
+            if name in STAMPS:
+                continue
+            if isinstance(inside, np.ndarray) or _is_list(inside):
+                yield from _list_leaves(inside, (*path, name), names)
+            else:
+                yield from _leaves(inside, (*path, name))
+
+
+def _list_leaves(values: Any, path: tuple[str, ...], names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], float]]:
+    if len(values) == 0 or len(values) > LARGEST_VECTOR:
+        return
+    numbers = _numbers(values)
+    if numbers is not None:
+        labels = names if len(names) == len(numbers) else [str(index) for index in range(len(numbers))]
+        yield from (((*path, label), number) for label, number in zip(labels, numbers, strict=True))
+        return
+    for index, item in enumerate(values):
+        if isinstance(item, str | bytes):
+            return
+        label = _item_name(item) or str(index)
+        for inside, number in _leaves(item, ()):
+            # A plain field of an item joins the same field of its neighbours: one plot of all joints' positions.
+            yield ((*inside, label) if len(inside) == 1 else (*path, label, *inside)), number
+
+
+def _numbers(values: Any) -> list[float] | None:
+    """The values of a flat list or array of numbers; None for anything else."""
+    if not isinstance(values, np.ndarray) and not all(isinstance(value, bool | int | float) for value in values):
+        return None
+    array = np.asarray(values)
+    return array.astype(np.float64).tolist() if array.ndim == 1 and array.dtype.kind in "fiub" else None
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
+
+
+def _texts(value: Any) -> Sequence[str]:
+    return [str(text) for text in value] if value is not None and _is_list(value) else ()
+
+
+def _item_name(item: Any) -> str | None:
+    fields = dict(set_members(item))
+    return next((str(fields[name]) for name in ITEM_NAMES if isinstance(fields.get(name), str) and fields[name]), None)

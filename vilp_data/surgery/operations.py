@@ -1,0 +1,301 @@
+"""Dataset surgery: episodes removed, trimmed and relabelled. Files change names or, of the small steps files, content; no frame is
+decoded or encoded. Each call is one operation of the dataset's history, and `undo` takes it back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vilp_data import shards
+from vilp_data.check.motion import IDLE_S, IDLE_SHARE
+from vilp_data.dataset_split import find_split
+from vilp_data.episodes import EpisodeEntry, EpisodeStore, write_steps
+from vilp_data.errors import UsageError, nearest
+from vilp_data.surgery import history
+from vilp_data.surgery.dataset_state import frames_name, steps_name
+from vilp_data.surgery.edits import MIN_STEPS, relabelled, trimmed
+from vilp_data.surgery.history import Changes
+from vilp_data.surgery.idle import moving_range
+from vilp_data.surgery.removed import read_removed, removed_bytes, removed_episode, removed_path
+from vilp_data.types import OUTCOME_TAG, ROLLOUT_TAG
+
+MARGIN_S = 0.5
+"""Rest that is kept at either end: a policy should see what standing still looks like."""
+
+Steps = dict[str, npt.NDArray[Any]]
+
+
+@dataclass
+class SurgeryReport:
+    """What a call did. `operation` is None where there was nothing to do; `changed` are ids; `notes` sentences."""
+
+    operation: int | None = None
+    changed: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What a trim leaves of an episode: steps `first` to `end` (one past the last) of the `n_steps` there are now, the first of which is
+    step `counted_from` of the episode as it was ingested. `moves` False: nothing moves in it at all, and it is left as it is."""
+
+    id: str
+    first: int
+    end: int
+    n_steps: int
+    rate_hz: float
+    counted_from: int = 0
+    moves: bool = True
+
+    @property
+    def cuts(self) -> bool:
+        return self.end - self.first < self.n_steps
+
+
+# --- remove ----------------------------------------------------------------------------------------------------------------
+
+
+def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") -> SurgeryReport:
+    """Take episodes out. Their files wait in history/held/, their side of the split stays theirs, and ingesting their log again does
+    not bring them back unless asked to.
+
+    Raises UsageError for an unknown id (one that was removed before is none) and where nothing would be left."""
+    with shards.writer_lock(root):
+        store, removed = EpisodeStore(root), read_removed(root)
+        entries = {entry.id: entry for entry in store.index()}
+        report = SurgeryReport()
+        for id in dict.fromkeys(episodes):
+            if id in entries:
+                report.changed.append(id)
+            elif id in removed:
+                report.notes.append(f"{id}: removed already, by operation {removed[id].operation}")
+            else:
+                raise UsageError(f"no episode called {id!r}", where=root, remedy=nearest(id, entries))
+        if not report.changed:
+            _index_again(store)
+            return report
+        if len(report.changed) == len(entries):
+            remedy = "delete the folder instead, or keep an episode"
+            raise UsageError("no episode would be left", where=root, found=f"{len(entries)} to remove", remedy=remedy)
+        prepared = history.prepare(root)
+        for id in report.changed:
+            removed[id] = removed_episode(entries[id], reason=reason, operation=prepared[0])
+        changes = Changes(staged={}, removed=[])
+        for id in report.changed:
+            changes.removed.append(steps_name(id))
+            changes.removed += [
+                name for view in entries[id].n_frames if (root / (name := frames_name(view, id))).is_file()
+            ]
+        _stage_bytes(root, changes, removed_path(root).name, removed_bytes(removed))
+        note = f"{counted(report.changed)} removed" + (f": {reason}" if reason else "")
+        report.operation = history.perform(root, "remove", changes, note, prepared=prepared).number
+        store.write_index()
+        report.notes += _sides_left(store)
+    return report
+
+
+# --- trim ------------------------------------------------------------------------------------------------------------------
+
+
+def plan_trim(
+    root: Path, episodes: Sequence[str] = (), *, threshold: float = IDLE_SHARE, margin_s: float = MARGIN_S,
+    steps: tuple[int | None, int | None] | None = None,
+) -> list[Cut]:  # fmt: skip
+    """What `trim_episodes` would leave of each of `episodes` (of all, where none is named). Nothing is written.
+
+    Idle ends are found by `idle.moving_range` over low_dim and action, with `margin_s` seconds kept beside the motion; one that is
+    shorter than `check_motion.IDLE_S` stays, as `check` does not mention it either. `steps` names
+    the range to keep instead, as a slice of Python does: (10, None), (None, -5); it counts the steps that ingest gave the episode, so
+    that doing it twice does nothing more. Raises UsageError as `trim_episodes`."""
+    if not 0 < threshold < 1:
+        remedy = "0.02 is two percent of the range that each column covers"
+        raise UsageError("a threshold of motion lies between 0 and 1", found=threshold, remedy=remedy)
+    if margin_s < 0:
+        raise UsageError("a margin is no negative number of seconds", found=margin_s, remedy="0 keeps no rest at all")
+    store = EpisodeStore(root)
+    cuts = []
+    for entry in _chosen(store, episodes):
+        if steps is not None:
+            first, end, _ = slice(*steps).indices(entry.whole_steps)
+            first, end = max(first - entry.first_step, 0), min(end - entry.first_step, entry.n_steps)
+            cuts.append(_cut(entry, first, end))
+        else:
+            cuts.append(_idle_cut(store, entry, threshold, margin_s))
+    return cuts
+
+
+def trim_episodes(root: Path, cuts: Sequence[Cut]) -> SurgeryReport:
+    """Do what `plan_trim` said. Frames files stay as they are, and so do latents; frames that no step sees any more are read by
+    nobody: no model, statistic or export.
+
+    Raises UsageError for an unknown id, for one that has other steps than when the plan was made, and where too little would be left."""
+    with shards.writer_lock(root):
+        store, report = EpisodeStore(root), SurgeryReport()
+        entries = {entry.id: entry for entry in store.index()}
+        wanted = [cut for cut in cuts if cut.cuts]
+        changes, gone = Changes(staged={}, removed=[]), 0
+        for cut in wanted:
+            entry = entries.get(cut.id)
+            if entry is None or entry.n_steps != cut.n_steps:
+                raise UsageError(
+                    f"{cut.id!r} changed since the trim was planned", where=root, remedy="run the command again"
+                )
+            kept, arrays = trimmed(entry, _steps_of(store, entry), cut.first, cut.end)
+            _stage_steps(root, changes, kept, arrays)
+            report.changed.append(cut.id)
+            gone += cut.n_steps - (cut.end - cut.first)
+        if report.changed:
+            note = f"{counted(report.changed)} trimmed by {gone} steps"
+            report.operation = history.perform(root, "trim", changes, note).number
+            store.write_index()
+        else:
+            _index_again(store)
+    return report
+
+
+def parse_steps(text: str) -> tuple[int | None, int | None]:
+    """`10:140`, `10:`, `:-5` -> (first, end), as in a slice of Python. Raises UsageError for anything else."""
+    match = re.fullmatch(r"(-?\d+)?:(-?\d+)?", text)
+    if match is None:
+        remedy = "FIRST:END, such as 10:140, 10: or :-5; the end is left out"
+        raise UsageError("no range of steps", found=repr(text), remedy=remedy)
+    first, end = match.groups()
+    return (int(first) if first else None, int(end) if end else None)
+
+
+def _idle_cut(store: EpisodeStore, entry: EpisodeEntry, threshold: float, margin_s: float) -> Cut:
+    steps = _steps_of(store, entry)
+    columns = [steps["low_dim"], *([steps["action"]] if "action" in steps else [])]
+    moving = moving_range(np.concatenate(columns, axis=1).astype(np.float64), steps["valid"], threshold=threshold)
+    if moving is None:
+        return _cut(entry, 0, entry.n_steps, moves=False)
+    margin, pause = round(margin_s * entry.rate_hz), IDLE_S * entry.rate_hz
+    first = max(moving[0] - margin, 0) if moving[0] > pause else 0
+    end = min(moving[1] + margin, entry.n_steps) if entry.n_steps - moving[1] > pause else entry.n_steps
+    if end - first < MIN_STEPS or not steps["valid"][first:end].any():
+        first, end = 0, entry.n_steps
+    return _cut(entry, first, end)
+
+
+def _cut(entry: EpisodeEntry, first: int, end: int, *, moves: bool = True) -> Cut:
+    return Cut(entry.id, first, end, entry.n_steps, entry.rate_hz, entry.first_step, moves=moves)
+
+
+# --- relabel ---------------------------------------------------------------------------------------------------------------
+
+
+def relabel_episodes(
+    root: Path, episodes: Sequence[str], *, labels: Mapping[str, str] | None = None, unset: Iterable[str] = ()
+) -> SurgeryReport:
+    """Set and take away tags of `episodes`. The outcome follows the tag `success`. Labels are kept when the log is ingested again.
+
+    Raises UsageError for an unknown id, a tag that is set and unset, and the tag by which a policy's own episodes are known."""
+    labels, unset = dict(labels or {}), tuple(dict.fromkeys(unset))
+    _refuse_labels(labels, unset)
+    with shards.writer_lock(root):
+        store, report = EpisodeStore(root), SurgeryReport()
+        changes = Changes(staged={}, removed=[])
+        for entry in _chosen(store, episodes, all_by_default=False):
+            labelled = relabelled(entry, labels=labels, unset=unset)
+            if labelled != entry:
+                _stage_steps(root, changes, labelled, _steps_of(store, entry))
+                report.changed.append(entry.id)
+            missing = [tag for tag in unset if tag not in entry.tags]
+            report.notes += [f"{entry.id}: has no tag {', '.join(map(repr, missing))}"] if missing else []
+        if report.changed:
+            said = [f"{tag} = {value}" for tag, value in labels.items()] + [f"no {tag}" for tag in unset]
+            note = f"{counted(report.changed)} relabelled: {', '.join(said)}"
+            report.operation = history.perform(root, "relabel", changes, note).number
+            store.write_index()
+            report.notes += _about_labels(root, labels, unset)
+        else:
+            _index_again(store)
+    return report
+
+
+def _refuse_labels(labels: Mapping[str, str], unset: Sequence[str]) -> None:
+    if not labels and not unset:
+        raise UsageError("no label to set or to take away", remedy="--set KEY=VALUE, --outcome success, or --unset KEY")
+    both = sorted({*labels}.intersection(unset))
+    if both:
+        raise UsageError("a label that is set and taken away", found=both[0], remedy="name it once")
+    name, value = ROLLOUT_TAG
+    if name in unset or name in labels:
+        raise UsageError(
+            f"the tag {name!r} is not a label: it says whether a policy made the episode ({name} = {value})",
+            remedy="take such an episode out with `vilp-data remove`; a policy's own are stored by `ingest --with-rollouts`",
+        )
+
+
+def _about_labels(root: Path, labels: Mapping[str, str], unset: Sequence[str]) -> list[str]:
+    notes, lock = [], find_split(root)
+    drawn_by = {*(lock.strata if lock else ()), *([lock.group_by] if lock and lock.group_by else [])}.intersection(
+        {*labels, *unset}
+    )
+    if drawn_by:
+        tag = min(drawn_by)
+        notes.append(
+            f"the split was drawn by {tag!r}: nothing changes sides; `vilp-data split --check` says if it still fits"
+        )
+    if labels.get(OUTCOME_TAG, "").lower() == "false":
+        notes.append("failures that are stored stay where they are; `vilp-data remove` takes them out of training")
+    return notes
+
+
+# --- shared ------------------------------------------------------------------------------------------------------------------
+
+
+def counted(ids: Sequence[str], limit: int = 3) -> str:
+    """`2 episodes (a, b)`"""
+    listed = ", ".join(ids[:limit]) + (", …" if len(ids) > limit else "")
+    return f"{len(ids)} episode{'' if len(ids) == 1 else 's'} ({listed})"
+
+
+def _chosen(store: EpisodeStore, episodes: Sequence[str], *, all_by_default: bool = True) -> list[EpisodeEntry]:
+    """The entries named, or all; in the order of ids. Raises UsageError naming the nearest id."""
+    entries = {entry.id: entry for entry in store.index()}
+    for id in episodes:
+        if id not in entries:
+            removed = read_removed(store.root)
+            found = f"removed by operation {removed[id].operation}" if id in removed else None
+            raise UsageError(f"no episode called {id!r}", where=store.root, found=found, remedy=nearest(id, entries))
+    return [entries[id] for id in sorted(set(episodes))] if episodes or not all_by_default else list(entries.values())
+
+
+def _steps_of(store: EpisodeStore, entry: EpisodeEntry) -> Steps:
+    return dict(shards.read_shard(store.steps_path(entry.id)).arrays)
+
+
+def _stage_steps(root: Path, changes: Changes, entry: EpisodeEntry, steps: Steps) -> None:
+    name = steps_name(entry.id)
+    changes.staged[name] = history.stage(root, name)
+    write_steps(changes.staged[name], entry, steps)
+
+
+def _stage_bytes(root: Path, changes: Changes, name: str, data: bytes) -> None:
+    changes.staged[name] = history.stage(root, name)
+    shards.write_atomic(changes.staged[name], data)
+
+
+def _index_again(store: EpisodeStore) -> None:
+    """Write the index that a killed operation could not write any more."""
+    if not store.index_path.is_file():
+        store.write_index()
+
+
+def _sides_left(store: EpisodeStore) -> list[str]:
+    lock = find_split(store.root)
+    if lock is None:
+        return []
+    there = {lock.assignment.get(entry.id) for entry in store.index()}
+    return [
+        f"the split has no {word} episode any more: add some, or `vilp-data split --redraw`"
+        for side, word in (("train", "training"), ("val", "validation"))
+        if side not in there
+    ]
