@@ -11,8 +11,8 @@ from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from vilp_data.contact_sheet import as_rgb
 from vilp_data.types import U8
-from vilp_models.contact_sheet import as_rgb
 
 FRAME_MS = 200
 FOLDER = "tensorboard"

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from vilp_data.contact_sheet import ERROR_GAIN, SCALE, captioned, error_image, stacked, to_png
 from vilp_data.types import U8
-from vilp_models.contact_sheet import ERROR_GAIN, SCALE, captioned, error_image, stacked, to_png
 from vilp_models.fidelity import (
     ENOUGH_DB,
     PRECISION_STRIDE,

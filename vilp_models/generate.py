@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vilp_data.contact_sheet import ERROR_GAIN, captioned, error_image, grid, stacked, to_png
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
@@ -21,7 +22,6 @@ from vilp_data.shards import write_atomic
 from vilp_data.spec import WindowSpec
 from vilp_data.types import F16, F32, F64, U8
 from vilp_data.viewer.canvas import draw_clip
-from vilp_models.contact_sheet import ERROR_GAIN, captioned, error_image, grid, stacked, to_png
 from vilp_models.imagined import Decoder, Imagination, decode_frames, read_recorded, recorded_starts, spread
 from vilp_models.video import write_mp4
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from vilp_data.contact_sheet import ERROR_GAIN, captioned, error_image, grid, stacked, to_png
 from vilp_data.types import U8
-from vilp_models.contact_sheet import ERROR_GAIN, captioned, error_image, grid, stacked, to_png
 from vilp_models.metrics import MOVING_THRESHOLD
 from vilp_models.plan_errors import MEASURES, RESAMPLES, Measure, Score
 from vilp_models.planner_report import BASELINE, CANDIDATES, IMAGINED, Example, PlannerReport, ViewReport

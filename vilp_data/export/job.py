@@ -15,7 +15,6 @@ from vilp_data.export.pieces import Chosen, Piece, Rows, Shapes, read_pieces
 from vilp_data.export.video import frame_rate
 from vilp_data.plots import vector_parts
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.split_lock import Side
 from vilp_data.types import F32, U8
 
 Images = Literal["h264", "h264-420", "lossless", "png"]
@@ -166,7 +165,3 @@ def _squared_error(one: U8, other: U8) -> float:
 
 def _psnr(mean_squared: float) -> float:
     return round(float(10 * np.log10(255.0**2 / mean_squared)), 2)
-
-
-def side_words(side: Side | None) -> str:
-    return {"train": "training", "val": "validation", None: "no side"}[side]
