@@ -21,6 +21,7 @@ from vilp_models.planner import Condition, Planner
 from vilp_models.policies.base import Observation
 from vilp_models.policies.vilp import VilpPolicy
 from vilp_models.recipe import PlannerRecipe, PolicyRecipe, VqganRecipe
+from vilp_models.trained import default_device
 from vilp_models.unet3d import OneTokenAttention
 from vilp_models.vqgan import VqganEncoder, build_vqgan
 
@@ -80,11 +81,14 @@ def main() -> None:
     arguments.add_argument("--plans", type=int, default=3)
     arguments.add_argument("--width", type=int, default=64, help="of the planner; the paper's 64 (Can) or 128 (Push-T)")
     given = arguments.parse_args()
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads; planner width {given.width}, VQGAN width 128")
+    device = default_device()
+    print(
+        f"torch {torch.__version__}, {torch.get_num_threads()} threads, {device}; planner width {given.width}, VQGAN width 128"
+    )
     for height, width, n_frames, n_actions in ((96, 96, 12, 16), (96, 160, 6, 8), (96, 160, 6, 4)):
         torch.manual_seed(0)
         made_for = contract(height, width, n_frames)
-        planner = Planner(PlannerRecipe(width=given.width, low_dim=False), made_for, VIEW)
+        planner = Planner(PlannerRecipe(width=given.width, low_dim=False), made_for, VIEW).to(device)
         for parameter in planner.parameters():  # layers that begin at zero would make both plans equal whatever they do
             if not parameter.any():
                 torch.nn.init.normal_(parameter, std=0.02)
@@ -92,12 +96,12 @@ def main() -> None:
         torch.nn.init.normal_(
             model.quantize.embedding.weight
         )  # as far apart as latents are, or all would be near a tie
-        encoder = VqganEncoder(model)
+        encoder = VqganEncoder(model, device=device)
         frames = torch.randint(0, 256, (1, height, width, 3), dtype=torch.uint8).numpy()
         observation = Observation({VIEW: frames}, np.zeros((1, 0), np.float32), np.zeros((1, 2), np.float32))
-        from_frames = LowLevelPolicy(PolicyRecipe(), made_for)
+        from_frames = LowLevelPolicy(PolicyRecipe(), made_for).to(device)
         codebooks = {VIEW: model.quantize.embedding.weight}
-        from_latents = LowLevelPolicy(PolicyRecipe(sees="latents"), made_for, codebooks=codebooks)
+        from_latents = LowLevelPolicy(PolicyRecipe(sees="latents"), made_for, codebooks=codebooks).to(device)
         policies = {
             "plainly": VilpPolicy(
                 {VIEW: plain(planner)}, {VIEW: encoder}, from_frames, n_action_steps=n_actions, decode_all=True
@@ -114,8 +118,8 @@ def main() -> None:
         for name, policy in policies.items():
             seconds, parts = timed(policy, observation, plans=given.plans)
             base = base or seconds
-            told = ", ".join(f"{part} {spent:.2f}" for part, spent in parts.items())
-            print(f"  {name:<22}{seconds:6.2f} s a plan   {base / seconds:5.2f}x   ({told})")
+            told = ", ".join(f"{part} {spent * 1e3:.0f}" for part, spent in parts.items())
+            print(f"  {name:<22}{seconds * 1e3:7.0f} ms a plan   {base / seconds:5.2f}x   ({told})")
 
 
 def same_output(one: VilpPolicy, other: VilpPolicy, observation: Observation) -> float:

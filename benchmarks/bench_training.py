@@ -24,6 +24,7 @@ from vilp_models.model_training import ModelTraining
 from vilp_models.planner import Planner
 from vilp_models.processes import Processes
 from vilp_models.recipe import PlannerRecipe, VqganRecipe, load_recipe
+from vilp_models.trained import default_device
 from vilp_models.vqgan import VqganEncoder, build_vqgan
 
 VIEW = VIEWS[0]
@@ -81,15 +82,18 @@ def report(title: str, given: Sequence[ModelTraining], names: Sequence[str], *, 
     share = (given[0].waited_s - waited) / sum(seconds[0][1:])
     print(f"\n{title}")
     for name, value in zip(names, middle, strict=True):
-        print(f"  {name:<18}{value:7.2f} s a step   {value / middle[0]:5.2f}x")
+        print(f"  {name:<18}{value:7.3f} s a step   {value / middle[0]:5.2f}x")
     print(f"  waiting for data: {share:.2%} of a step from cached latents")
 
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--steps", type=int, default=5)
-    steps = arguments.parse_args().steps
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
+    arguments.add_argument(
+        "--batch", type=int, default=2, help="of the paper's planner; its own 64 needs an accelerator"
+    )
+    given = arguments.parse_args()
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads, {default_device()}")
     small = {
         **load_recipe(PlannerRecipe, "planner", {}, preset="cpu", where="bench").model_dump(),
         "condition": "concat",
@@ -100,7 +104,7 @@ def main() -> None:
             root = Path(folder)
             write_dataset(root, n_episodes=10, n_steps=60, height=height, width=width)
             write_split(root, ratio=0.9)
-            paper = PlannerRecipe(low_dim=False, batch_size=2)
+            paper = PlannerRecipe(low_dim=False, batch_size=given.batch)
             cpu = PlannerRecipe.model_validate(small)
             for name, recipe, vqgan in (
                 ("paper (planner 64, VQGAN 128)", paper, VqganRecipe()),
@@ -108,7 +112,7 @@ def main() -> None:
             ):
                 made = trainings(root, recipe, vqgan, height=height, width=width, n_frames=n_frames)
                 title = f"{name}: {height}x{width}, {n_frames} frames, batch {recipe.batch_size}, {recipe.precision}"
-                report(title, list(made.values()), list(made), steps=steps)
+                report(title, list(made.values()), list(made), steps=given.steps)
                 for training in made.values():
                     training.close()
 

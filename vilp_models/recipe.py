@@ -337,8 +337,8 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "bc": {
         "tiny": {**_ADAM_SMALL, "vision_width": 8, "pool": "keypoints", "hidden": (64,), "steps": 12, "batch_size": 8, "warmup_steps": 2},
         "cpu": {
-            **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints",
-            "steps": 3000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
+            **_ADAM_SMALL, "vision_width": 16, "pool": "keypoints", "low_dim": False,
+            "steps": 12_000, "batch_size": 64, "warmup_steps": 100, "precision": "bf16",
         },
         "paper": {},
     },
