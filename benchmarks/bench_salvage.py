@@ -1,16 +1,21 @@
-"""Salvage against what the Python readers get out of the same damaged logs: how many messages, and how fast.
+"""Salvage against what the Python readers and rerun get out of the same damaged logs: how many messages, and how fast.
 
     python benchmarks/bench_salvage.py
 
-The mcap library's stream reader (the one that needs no index) and rosbags' reader count what they yield before they give up. Salvage
-also inflates what they leave, checks every checksum, and writes the clean MCAP with fsync; the readers write nothing.
+The mcap library's stream reader (the one that needs no index) and rosbags' readers count what they yield before they give up; of
+`rerun mcap convert --recover` the messages in the recording that it writes are counted (the command's start included in its time).
+Salvage also inflates what they leave, checks every checksum, and writes the clean MCAP with fsync; the readers write nothing.
 """
 
 from __future__ import annotations
 
 import random
+import re
 import shutil
+import sqlite3
 import struct
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -39,21 +44,25 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="vilp-bench-"))
     print(f"salvage, {MESSAGES} messages of about {BYTES} bytes; messages got back, and MB/s of damaged log")
-    print(f"  {'log':22s} {'damage':16s} {'the reader':>18s} {'salvage':>18s} {'suspicious':>10s}")
+    columns = f"{'the reader':>18s} {'rerun --recover':>18s} {'salvage':>18s} {'suspicious':>10s} {'lost':>6s}"
+    print(f"  {'log':20s} {'damage':16s} {columns}")
     try:
         for name, options in LAYOUTS.items():
             path = folder / "run.mcap"
             write_mcap(path, options)
-            compare(name, path, mcap_count)
+            compare(name, path, mcap_count, rerun_count)
         for compression in ("none", "lz4", "bz2"):
             path = folder / "run.bag"
             write_bag(path, compression)
             compare(f"bag {compression}", path, rosbags_count)
+        path = folder / "run.db3"
+        write_db3(path)
+        compare("db3", path, db3_count)
     finally:
         shutil.rmtree(folder)
 
 
-def compare(name: str, path: Path, count: Callable[[Path], int]) -> None:
+def compare(name: str, path: Path, count: Callable[[Path], int], other: Callable[[Path], int] | None = None) -> None:
     content = path.read_bytes()
     middle = len(content) // 2
     damages = {
@@ -64,21 +73,45 @@ def compare(name: str, path: Path, count: Callable[[Path], int]) -> None:
     }
     for damage, damaged in damages.items():
         path.write_bytes(damaged)
-        theirs, their_s = timed(lambda: count(path))
-        (ours, suspicious), our_s = timed(lambda: salvaged_count(path))
         size = len(damaged) / 1e6
-        speeds = f"{theirs:6d} {size / their_s:6.0f} MB/s {ours:6d} {size / our_s:6.0f} MB/s {suspicious:10d}"
+        theirs, their_s = timed(lambda: count(path))
+        (ours, suspicious, lost), our_s = timed(lambda: salvaged_count(path))
+        cells = [f"{theirs:6d} {size / their_s:6.0f} MB/s", " " * 18, f"{ours:6d} {size / our_s:6.0f} MB/s"]
+        if other is not None and RERUN is not None:
+            others, other_s = timed(lambda: other(path))
+            cells[1] = f"{others:6d} {size / other_s:6.0f} MB/s"
         more = f"{ours / theirs:.2f}x messages, {their_s / our_s:.2f}x speed" if theirs else "the reader gives nothing"
-        print(f"  {name:22s} {damage:16s} {speeds}   {more}")
+        print(f"  {name:20s} {damage:16s} {' '.join(cells)} {suspicious:10d} {lost:>6s}   {more}")
 
 
-def salvaged_count(path: Path) -> tuple[int, int]:
-    """Messages got back, and how many of them are suspicious."""
+def salvaged_count(path: Path) -> tuple[int, int, str]:
+    """Messages got back, how many of them are suspicious, and how many are said to be lost (`0?` where all came back in doubt)."""
     try:
         report = salvage_log(path, path.with_name("clean.mcap"), force=True)
     except LogError:
-        return 0, 0
-    return report.recovered, report.suspicious
+        return 0, 0, "all"
+    lost = "?" if report.lost is None else str(report.lost)
+    return report.recovered, report.suspicious, lost if report.complete or report.lost != 0 else "0?"
+
+
+PATIENCE_S = 30  # for a command that takes half a second on a whole log
+RERUN = shutil.which("rerun", path=str(Path(sys.executable).parent)) or shutil.which("rerun")
+
+
+def rerun_count(path: Path) -> int:
+    """Messages in the recording that rerun makes of the log; its static rows describe channels."""
+    out = path.with_name("out.rrd")
+    out.unlink(missing_ok=True)
+    command = [str(RERUN), "mcap", "convert", "--recover", "-d", "raw", str(path), "-o", str(out)]
+    try:
+        subprocess.run(command, capture_output=True, timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        return 0
+    if not out.exists():
+        return 0
+    text = subprocess.run([str(RERUN), "rrd", "stats", str(out)], capture_output=True, text=True).stdout
+    rows, static = (int(re.sub(r"\D", "", found)) for found in re.findall(r"^num_(?:rows|static) = (.*)$", text, re.M))
+    return rows - static
 
 
 def mcap_count(path: Path) -> int:
@@ -99,6 +132,18 @@ def rosbags_count(path: Path) -> int:
             for _ in reader.messages():
                 count += 1
     except Exception:
+        return count
+    return count
+
+
+def db3_count(path: Path) -> int:
+    """Rows that rosbags' query gives before SQLite stops it."""
+    count = 0
+    try:
+        with sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True) as database:
+            for _ in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp"):
+                count += 1
+    except sqlite3.Error:
         return count
     return count
 
@@ -131,6 +176,19 @@ def write_bag(path: Path, compression: str) -> None:
         ]
         for k, data in enumerate(payloads()):
             writer.write(connections[k % 4], k * 1000, bytes(8) + struct.pack("<I", len(data)) + data)
+
+
+def write_db3(path: Path) -> None:
+    with sqlite3.connect(path) as database:
+        database.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format, offered_qos_profiles)"
+        )
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+        database.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+        topics = [(i + 1, f"/t{i}", "std_msgs/msg/UInt8MultiArray", "cdr", "") for i in range(4)]
+        database.executemany("INSERT INTO topics VALUES(?, ?, ?, ?, ?)", topics)
+        rows = [(k % 4 + 1, k * 1000, bytes(12) + data) for k, data in enumerate(payloads())]
+        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Before a process's n-th call of fsync or rename it kills itself: the moments at which what is on disk changes.
+# Before a process's n-th call of one of these it kills itself: the moments at which what is on disk changes.
+WRITES = ("fsync", "rename", "replace")
+ALL_CHANGES = (*WRITES, "unlink", "link", "rmdir")
 KILLER = """
 import os, signal
 _calls = 0
@@ -25,7 +29,8 @@ def _dying(function):
             os.kill(os.getpid(), signal.SIGKILL)
         return function(*args, **kwargs)
     return wrapped
-os.fsync, os.rename, os.replace = _dying(os.fsync), _dying(os.rename), _dying(os.replace)
+for _name in {names}:
+    setattr(os, _name, _dying(getattr(os, _name)))
 """
 
 
@@ -35,14 +40,33 @@ def kill_moments(*, few: int, many: int) -> list[Any]:
     return [pytest.param(n, marks=() if n in chosen else pytest.mark.slow, id=f"kill-{n}") for n in range(1, many + 1)]
 
 
-def run_until_killed(code: str, arguments: list[str], *, nth: int) -> bool:
-    """Run Python code in a process that is killed at its n-th fsync or rename; False where it ended before that."""
-    program = textwrap.dedent(KILLER.format(nth=nth)) + code
+def run_until_killed(code: str, arguments: list[str], *, nth: int, names: Sequence[str] = WRITES) -> bool:
+    """Run Python code in a process that is killed at its n-th call of a function of `os` of these names; False where it ended before
+    that."""
+    program = textwrap.dedent(KILLER.format(nth=nth, names=tuple(names))) + code
     ended = subprocess.run(
         [sys.executable, "-c", program, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert ended.returncode in (0, -9), ended.stderr
     return ended.returncode == -9
+
+
+def call_until_killed(
+    function: Callable[..., None], *arguments: object, nth: int, names: Sequence[str] = ALL_CHANGES
+) -> bool:
+    """As `run_until_killed`, for a function of a test module: its process is forked from one that has imported the module already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([function.__module__])
+    process = context.Process(target=_call_dying, args=(nth, tuple(names), function, arguments))
+    process.start()
+    process.join()
+    assert process.exitcode in (0, -9)
+    return process.exitcode == -9
+
+
+def _call_dying(nth: int, names: Sequence[str], function: Callable[..., None], arguments: Sequence[object]) -> None:
+    exec(KILLER.format(nth=nth, names=names), {})
+    function(*arguments)
 
 
 def run_until_files(code: str, arguments: list[str], *, folder: Path, count: int) -> bool:

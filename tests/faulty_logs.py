@@ -56,11 +56,13 @@ def robot(n: int, seed: int = 0, *, follow: float = 0.6) -> tuple[np.ndarray, np
     return state + 1e-3 * rng.standard_normal(state.shape), target
 
 
-def write_faulty(path: Path, *, duration_s: float = 20.0, seed: int = 0, **faults: Any) -> Path:
+def write_faulty(
+    path: Path, *, duration_s: float = 20.0, seed: int = 0, rate_hz: float = RATE_HZ, **faults: Any
+) -> Path:
     """Write one log of `duration_s` with the faults named (see Faults)."""
     wrong = Faults(**faults)
-    n = round(duration_s * RATE_HZ)
-    at_s = np.arange(n) / RATE_HZ
+    n = round(duration_s * rate_hz)
+    at_s = np.arange(n) / rate_hz
     rng = np.random.default_rng([seed, 1])
     state, action = robot(n, seed)
     state, action = _spoilt_vectors(wrong, at_s, state, action)
@@ -94,7 +96,8 @@ def _spoilt_vectors(
 ) -> tuple[np.ndarray, np.ndarray]:
     if wrong.idle is not None:
         first, last = np.searchsorted(at_s, (wrong.idle[0], at_s[-1] - wrong.idle[1]))
-        state[:first], state[last:] = state[first], state[last]
+        for values in (state, action):
+            values[:first], values[last:] = values[first], values[last]
     if wrong.stuck is not None:
         first, last = np.searchsorted(at_s, wrong.stuck)
         state[first:last] = state[first]

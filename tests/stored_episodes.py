@@ -8,6 +8,7 @@ import numpy as np
 
 from vilp_data import shards
 from vilp_data.episodes import EpisodeStore, Origin
+from vilp_data.keys import FORMAT_VERSION
 from vilp_data.latents import latents_path
 from vilp_data.spec import task_from_dict
 from vilp_data.split import SplitEpisode, draw_split
@@ -46,7 +47,7 @@ def write_latents(root: Path, name: str, *, views: tuple[str, ...] = VIEWS) -> N
     entry = EpisodeStore(root).entry(name)
     for view in views:
         latents = np.random.default_rng(len(name)).standard_normal((entry.n_frames[view], 3, 2, 4)).astype(np.float16)
-        header = {"source_frames_sha256": entry.frames_sha256[view]}
+        header = {"format": str(FORMAT_VERSION), "source_frames_sha256": entry.frames_sha256[view]}
         shards.write_shard(latents_path(root, view, KEYS[view], name), {"latents": latents}, header)
 
 

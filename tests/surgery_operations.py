@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.stored_episodes import episode, write_dataset, write_latents
+from tests.synthetic import zarr_task_spec
 from vilp_data.dataset_split import update_split
 from vilp_data.episodes import EpisodeStore, Origin
+from vilp_data.ingest import ingest_logs
 from vilp_data.surgery.merge import merge_datasets
 from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
 from vilp_data.surgery.undo import undo
@@ -37,5 +39,13 @@ def operate(root: Path, what: str) -> None:
         merge_datasets(root.parent / "other", root)
     elif what == "split":
         split(root, seed=3, redraw=True)
-    else:
-        undo(root, 2)
+    elif what == "undo":
+        undo(root, 3)
+    elif what == "undo the last":
+        undo(root)
+    else:  # "redo": an undo taken back
+        undo(root, 4)
+
+
+def ingest_all(log: Path, root: Path) -> None:
+    ingest_logs([log], root, zarr_task_spec(), workers=1)

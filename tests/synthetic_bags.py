@@ -16,11 +16,12 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
 
 from tests.synthetic import STORE, SyntheticLog
 
 ROS1_STORE = get_typestore(Stores.ROS1_NOETIC)
-SUFFIX = {"sqlite3": ".db3", "mcap": ".mcap"}
+BAG = "rosbag2_bagfile_information"
 
 
 class Raw(NamedTuple):
@@ -89,18 +90,28 @@ def write_rosbag2(
     if parts == 1:
         _write_part(folder, messages, storage, compression, custom)
         return folder
-    names = []
+    described = []
     folder.mkdir(parents=True)
     for number in range(parts):
         part = folder.with_name(f"{folder.name}_{number}")
         _write_part(part, messages[number * size : (number + 1) * size], storage, compression, custom)
         (file,) = (file for file in part.iterdir() if file.name != "metadata.yaml")
         file.rename(folder / file.name)
-        names.append(file.name)
-        text = (part / "metadata.yaml").read_text()
+        described.append(YAML(typ="safe").load(part / "metadata.yaml")[BAG])
         shutil.rmtree(part)
-    (folder / "metadata.yaml").write_text(with_files(text, names))
+    YAML().dump({BAG: _joined(described)}, folder / "metadata.yaml")
     return folder
+
+
+def _joined(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """What metadata.yaml says of a bag of several files; the topics are those of the last."""
+    names = [name for part in parts for name in part["relative_file_paths"]]
+    counted = {"message_count": sum(part["message_count"] for part in parts)}
+    return (
+        parts[-1]
+        | counted
+        | {"relative_file_paths": names, "files": [file for part in parts for file in part["files"]]}
+    )
 
 
 def with_files(metadata: str, names: list[str]) -> str:

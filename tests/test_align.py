@@ -9,10 +9,16 @@ from hypothesis import strategies as st
 
 from vilp_data import align
 from vilp_data.errors import AlignError
+from vilp_data.vector_tracks import FieldsTrack
 
 MS = 1_000_000
 stamps = st.lists(st.integers(0, 2000), min_size=1, max_size=40).map(lambda xs: np.sort(np.array(xs, np.int64)) * MS)
 ticks = st.integers(2, 20).map(lambda n: np.arange(n, dtype=np.int64) * 100 * MS)
+
+
+def numbered(stamps_ns: np.ndarray) -> FieldsTrack:
+    """A track that says at each stamp which one it is."""
+    return FieldsTrack(stamps_ns, np.arange(float(len(stamps_ns)))[:, None])
 
 
 @given(stamps, ticks)
@@ -31,10 +37,20 @@ def test_an_observation_is_the_latest_message_at_or_before_its_tick(
 def test_an_absolute_command_is_the_last_issued_before_the_next_tick(
     stamps_ns: np.ndarray, ticks_ns: np.ndarray
 ) -> None:
-    index = align.command_in_force(stamps_ns, ticks_ns, period_ns=100 * MS)
+    latest = numbered(stamps_ns).at(align.last_instants(ticks_ns, period_ns=100 * MS))
     for k, tick in enumerate(ticks_ns):
         issued = [i for i, stamp in enumerate(stamps_ns) if stamp < tick + 100 * MS]
-        assert index[k] == (issued[-1] if issued else -1)
+        np.testing.assert_equal(latest.values[k, 0], issued[-1] if issued else np.nan)
+
+
+@given(stamps, ticks)
+def test_a_vector_is_the_latest_at_or_before_its_tick_and_says_how_old_it_is(
+    stamps_ns: np.ndarray, ticks_ns: np.ndarray
+) -> None:
+    latest = numbered(stamps_ns).at(ticks_ns + align.TOLERANCE_NS)
+    observed = align.observe(stamps_ns, ticks_ns, stale_after_s=0.25)
+    np.testing.assert_equal(latest.values[:, 0], np.where(observed.index < 0, np.nan, observed.index))
+    np.testing.assert_equal(latest.age_s(ticks_ns).astype(np.float32), observed.age_s)
 
 
 @given(stamps, ticks, st.integers(0, 2**32 - 1))
@@ -58,7 +74,8 @@ def test_rounding_to_nanoseconds_does_not_cost_a_frame() -> None:
     stamps_ns = np.round((7 + np.arange(60)) * 1e9 / 30).astype(np.int64)
     ticks_ns = align.control_ticks({"front": stamps_ns}, 30.0)
     assert align.observe(stamps_ns, ticks_ns, stale_after_s=1.0).index.tolist() == list(range(60))
-    assert align.command_in_force(stamps_ns, ticks_ns, period_ns=33_333_333).tolist() == list(range(60))
+    in_force = numbered(stamps_ns).at(align.last_instants(ticks_ns, period_ns=33_333_333))
+    assert in_force.values[:, 0].tolist() == list(range(60))
 
 
 def test_one_delta_a_tick_comes_through_bit_for_bit() -> None:

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.synthetic import card_frame, colour_card, encode_image, psnr
-from tests.video_packets import GROUP, encode, numbered_frames, video_message
-from vilp_data.check.cameras import COMPARED, FROZEN_S, Glance, camera_findings, glance, thumbnails_of
+from tests.video_packets import GROUP, encode, numbered_frames, parted, video_message
+from vilp_data.check.cameras import COMPARED, FROZEN_S, FrameSample, camera_findings, sample_frame, thumbnails_of
 from vilp_data.check.findings import Finding
 from vilp_data.check.pictures import PictureReader, is_camera
+from vilp_data.decode.video_packet import packet_of
 from vilp_data.types import Message
 
 
@@ -22,12 +23,12 @@ def noisy(k: int) -> np.ndarray:
     return np.clip(card_frame(k).astype(np.int16) + noise, 0, 255).astype(np.uint8)
 
 
-def glances(frames: list[np.ndarray]) -> list[Glance]:
-    return [glance(frame, k / 2) for k, frame in enumerate(frames)]
+def samples(frames: list[np.ndarray]) -> list[FrameSample]:
+    return [sample_frame(frame, k / 2) for k, frame in enumerate(frames)]
 
 
 def judged(frames: list[np.ndarray], *, moved: bool | None = True) -> list[Finding]:
-    return list(camera_findings("/camera", glances(frames), moved=lambda start_s, end_s: moved))
+    return list(camera_findings("/camera", samples(frames), moved=lambda start_s, end_s: moved))
 
 
 @given(st.integers(0, 30), st.sampled_from([True, False, None]))
@@ -81,18 +82,28 @@ def test_one_picture_throughout_is_an_error_where_the_robot_moves_and_a_warning_
 
 
 def test_depth_of_one_channel_and_large_pictures_are_looked_at() -> None:
-    seen = glance(np.full((1080, 1920, 1), 90, np.uint8), 0.0)
+    seen = sample_frame(np.full((1080, 1920, 1), 90, np.uint8), 0.0)
     assert (seen.mean, seen.deviation, seen.thumbnail.shape) == (90.0, 0.0, (8, 8))
 
 
 def test_thumbnails_are_spread_over_the_demonstration() -> None:
-    small = thumbnails_of(glances([noisy(k) for k in range(20)]))
+    small = thumbnails_of(samples([noisy(k) for k in range(20)]))
     assert small is not None
     assert small.shape == (COMPARED, 8, 8)
     assert thumbnails_of([]) is None
-    alone = thumbnails_of(glances([noisy(0)]))
+    alone = thumbnails_of(samples([noisy(0)]))
     assert alone is not None
     assert (alone == alone[0]).all()
+
+
+def test_a_keyframe_whose_parameters_came_before_it_is_looked_at_and_one_without_any_is_not() -> None:
+    keyframe = encode(numbered_frames(1), "h264")[0].data
+    parameters = packet_of(video_message(keyframe, "h264")).parameters.values()
+    alone, bare = (video_message(data, "h264") for data in parted(keyframe, parameters))
+    reader = PictureReader()
+    assert reader.read(bare) is None
+    assert reader.read(alone) is None
+    assert reader.read(bare) is not None
 
 
 @pytest.mark.parametrize("name", ["h264", "av1"])
@@ -106,7 +117,7 @@ def test_of_compressed_video_the_keyframes_are_looked_at(name: str) -> None:
     assert 0 < len(seen) < len(pictures)
     assert pictures[0] is not None
     assert len(seen) == 2
-    assert glance(seen[0], 0.0).deviation > 10
+    assert sample_frame(seen[0], 0.0).deviation > 10
 
 
 def test_depth_is_looked_at_relative_to_the_first_image() -> None:

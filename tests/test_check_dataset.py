@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.faulty_logs import robot
 from tests.stored_episodes import add_episodes
@@ -14,6 +15,7 @@ from vilp_data.check.sources import check_sources
 from vilp_data.dataset_split import update_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.spec import task_from_dict
+from vilp_data.surgery.operations import plan_trim
 from vilp_data.types import Episode
 
 SPEC = {
@@ -103,6 +105,20 @@ def test_copies_and_near_copies_are_found(tmp_path: Path) -> None:
     by_kind = {f.kind: f for f in found}
     assert by_kind["duplicate"].severity == "warning"
     assert "near-duplicate" in by_kind
+
+
+def test_idle_ends_are_those_that_trim_takes_off(tmp_path: Path) -> None:
+    still = episode(0, n=160)
+    still.low_dim[:40], still.low_dim[120:] = still.low_dim[40], still.low_dim[119]
+    assert still.action is not None
+    still.action[:25], still.action[120:] = still.action[25], still.action[119]
+    root = write(tmp_path, still, episode(1))
+    (found,) = (f for f in findings_of(root) if f.kind == "idle-ends")
+    (cut, _) = plan_trim(root, margin_s=0)
+    assert cut.id == found.place.episode == "run0"
+    assert 20 <= cut.first <= 26  # the commands begin before the robot does
+    assert found.evidence["idle_start_s"] == pytest.approx(cut.first / 10)
+    assert found.evidence["idle_end_s"] == pytest.approx((160 - cut.end) / 10)
 
 
 def test_masked_steps_are_counted(tmp_path: Path) -> None:

@@ -109,6 +109,19 @@ def test_a_copy_under_another_name_is_found(tmp_path: Path) -> None:
     assert "c.mcap" in found[0].what
 
 
+def test_logs_of_different_rates_are_not_fitted_together(tmp_path: Path) -> None:
+    """A step late is 50 ms in one and 100 ms in the other: one fit of both would have a remedy that is right for neither."""
+    fast = write_faulty(tmp_path / "fast.mcap", seed=1, action_late=1, duration_s=15)
+    more = write_faulty(tmp_path / "more.mcap", seed=2, action_late=1, duration_s=15)
+    slow = write_faulty(tmp_path / "slow.mcap", seed=3, action_late=1, duration_s=30, rate_hz=10)
+    report = check_sources([fast, more, slow])
+    assert [(fit.rate_hz, fit.fit.n_steps > 500) for fit in report.fits] == [
+        (pytest.approx(20, rel=0.01), True), (pytest.approx(10, rel=0.01), False),
+    ]  # fmt: skip
+    offsets = {str(f.remedy).split(" on ")[0] for f in report.findings if f.kind == "action-late"}
+    assert offsets == {"offset_s = -0.05", "offset_s = -0.1"}
+
+
 @pytest.mark.parametrize("keep", [0, 3, 100, 0.5, 0.99])
 def test_a_log_that_is_cut_off_is_an_error_with_salvage_as_its_remedy(tmp_path: Path, keep: float) -> None:
     whole = write_faulty(tmp_path / "whole.mcap", duration_s=5).read_bytes()
@@ -148,7 +161,7 @@ def test_a_path_without_a_log_is_wrong_use(tmp_path: Path) -> None:
 
 
 def test_what_is_kept_does_not_grow_with_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vilp_data.check.log.STRETCH_NUMBERS", 2000)
+    monkeypatch.setattr("vilp_data.check.log.SEGMENT_NUMBERS", 2000)
     monkeypatch.setattr("vilp_data.check.log.LOOK_EVERY", 100)
     path = write_faulty(tmp_path / "long.mcap", duration_s=40, gap=(20.0, 22.0), nan=(30.0, 31.0))
     report = check_sources([path])

@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 
 from vilp_data.check.findings import Finding
 from vilp_data.check.motion import (
-    IDLE_S,
     Series,
     idle_ends,
     idle_findings,
     moved_between,
-    moving_columns,
     series_findings,
 )
+from vilp_data.idle import IDLE_S, moving_columns
 
 NAMES = ("position.a", "position.b", "position.c")
 
@@ -125,7 +124,7 @@ def test_idle_ends_are_measured(start_s: float, end_s: float, seed: int) -> None
     rng = np.random.default_rng(seed)
     series.values[:first] = series.values[first] + 1e-4 * rng.standard_normal((first, 3))
     series.values[last:] = series.values[last - 1] + 1e-4 * rng.standard_normal((900 - last, 3))
-    found = idle_ends(series)
+    found = idle_ends(series.values, series.at_s)
     assert found is not None
     assert abs(found[0] - start_s) < 0.3
     assert abs(found[1] - end_s) < 0.3
@@ -137,7 +136,7 @@ def test_noise_alone_is_no_motion() -> None:
     at_s = np.arange(300) / 20
     noise = np.random.default_rng(0).standard_normal((300, 3))
     assert not moving_columns(noise).any()
-    assert idle_ends(Series("/joints", NAMES, at_s, noise)) is None
+    assert idle_ends(noise, at_s) is None
     assert not moved_between(Series("/joints", NAMES, at_s, noise), 0, 10)
 
 

@@ -16,6 +16,7 @@ from vilp_data.check.page import page
 from vilp_data.check.sources import check_sources
 from vilp_data.check.text import format_report
 from vilp_data.cli import app
+from vilp_data.errors import StoreError
 
 VOID = {"meta", "img", "br", "line", "rect", "polygon", "polyline", "link"}
 
@@ -90,6 +91,28 @@ def test_the_page_is_whole_and_needs_nothing_from_elsewhere(tmp_path: Path) -> N
     assert text.count("<svg") >= 4
     assert "prefers-color-scheme: dark" in text
     assert 'name="viewport"' in text
+
+
+def test_a_place_where_no_page_can_be_is_said_before_anything_is_checked(tmp_path: Path) -> None:
+    log = write_faulty(tmp_path / "run.mcap", duration_s=2)
+    (tmp_path / "file").write_text("mine")
+    for place in (tmp_path, tmp_path / "file" / "page.html"):
+        result = CliRunner().invoke(app, ["check", str(log), "--html", str(place)])
+        assert getattr(result.exception, "exit_code", None) == 2
+        assert result.stdout == ""
+
+
+def test_a_page_that_cannot_be_written_costs_none_of_the_findings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full_disk(path: Path, data: bytes) -> None:
+        raise StoreError("cannot be written", where=path, found="No space left on device")
+
+    log = write_faulty(tmp_path / "run.mcap", gap=(8.0, 10.0))
+    monkeypatch.setattr("vilp_data.shards.write_atomic", full_disk)
+    result = CliRunner().invoke(app, ["check", "--workers", "1", str(log), "--html", str(tmp_path / "page.html")])
+    assert getattr(result.exception, "exit_code", None) == 1
+    assert "silent for 2.00 s" in result.stdout
 
 
 def test_a_page_of_nothing_readable_is_still_a_page(tmp_path: Path) -> None:

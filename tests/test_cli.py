@@ -105,6 +105,7 @@ def test_json_output_is_json(work: Path) -> None:
         (["ingest", "task.toml", "--task", "task.toml"], 1, "not a log"),
         (["inspect", "nowhere.mcap"], 2, "no such log"),
         (["inspect", "task.toml"], 1, "not a log"),
+        (["inspect", "logs"], 2, "a folder of logs, not one log"),
         (["split"], 2, "which dataset"),
         (["split", "logs"], 2, "not a dataset"),
         (["view", "logs/run0.mcap"], 2, "--screenshot"),

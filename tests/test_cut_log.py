@@ -12,12 +12,13 @@ import pytest
 from tests.faults import tree
 from tests.json_log import START_NS, S, Said, image, joints, number, write_json_log
 from tests.synthetic import write_zarr, zarr_task_spec
+from vilp_data import cut_log
 from vilp_data.cut_log import preview
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.ingest import IngestReport, ingest_logs
 from vilp_data.sources.mcap_log import McapLog
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import SplitSpec, TaskSpec, load_task
 from vilp_data.staleness import stale_episodes
 
 MARKER = "/episode"
@@ -122,9 +123,70 @@ def test_a_ranges_file_gives_names_tags_and_outcomes(tmp_path: Path) -> None:
     report = ingest(log, tmp_path / "data", spec)
     assert report.written == ["run-at-00005.000s", "run-good"]
     assert report.left_out == ["run-bad"]
-    assert [name for name, _ in report.failed] == ["run-late"]
+    assert report.failed == []
+    assert "ranges outside the log's 10.0 s, and left out: late (90-91 s)" in report.notes[0]
     entry = EpisodeStore(tmp_path / "data").entry("run-good")
     assert (entry.outcome, entry.tags["operator"], entry.n_steps) == ("success", "kim", 10)
+
+
+def test_ranges_that_reach_outside_the_log_are_cut_to_it_and_named(tmp_path: Path) -> None:
+    log = write_session(tmp_path / "run.mcap")
+    cuts, notes = preview(log, write_task(tmp_path, "start,end,name\n-5,-3,early\n-2,1,first\n5,900,\n1,2.0,whole\n"))
+    assert [(cut.name, cut.start_s, round(cut.duration_s, 3)) for cut in cuts] == [
+        ("first", 0.0, 1.0),
+        ("whole", 1.0, 1.0),
+        ("at-00005.000s", 5.0, 5.0),
+    ]
+    assert "outside the log's 10.0 s, and left out: early (-5--3 s)" in notes[0]
+    assert "reaching outside the log's 10.0 s, and cut there: first (-2-1 s), 5-900 s" in notes[1]
+
+
+def test_ranges_that_overlap_are_refused_unless_a_log_stays_on_one_side_of_the_split(tmp_path: Path) -> None:
+    log = write_session(tmp_path / "run.mcap")
+    overlapping = write_task(tmp_path, "start,end,name\n5,6,late\n0,1.5,one\n1,2,two\n")
+    ((name, why),) = ingest(log, tmp_path / "data", overlapping).failed
+    assert (name, "one (0-1.5 s) and two (1-2 s)" in why, 'group_by = "log"' in why) == ("run.mcap", True, True)
+    grouped = overlapping.model_copy(update={"split": SplitSpec(group_by="log")})
+    assert len(ingest(log, tmp_path / "data", grouped).written) == 3
+    touching = write_task(tmp_path, "start,end\n0,1\n1,2\n")
+    assert len(preview(log, touching)[0]) == 2
+
+
+def bouncing(tmp_path: Path) -> Path:
+    frames = [message for k in range(40) for message in (image(k / 10, index=k), joints(k / 10, ["a"], [k / 10]))]
+    edges = ((0.5, True), (0.5002, False), (0.5004, True), (2.0, False), (2.00002, True), (2.00005, False))
+    return write_json_log(tmp_path / "run.mcap", [*frames, *(number(t, value, MARKER) for t, value in edges)])
+
+
+def test_a_button_that_bounces_marks_one_demonstration_and_leaves_the_rest_out(tmp_path: Path) -> None:
+    cuts, notes = preview(bouncing(tmp_path), task({"by": "topic", "topic": MARKER}))
+    assert [(cut.name, round(cut.duration_s, 4)) for cut in cuts] == [("at-00000.500s", 1.4996)]
+    assert "2 cuts shorter than 0.001 s left out" in notes[0]
+    cuts, notes = preview(bouncing(tmp_path), task({"by": "topic", "topic": MARKER, "min_duration_s": 0.5}))
+    assert len(cuts) == 1
+    assert "2 cuts shorter than min_duration_s = 0.5 left out" in notes[0]
+
+
+def test_spans_are_found_anew_once_the_rules_of_cutting_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = write_session(tmp_path / "run.mcap")
+    os.utime(log, (1e9, 1e9))
+    ingest(log, tmp_path / "data", task(BY_VALUE))
+    monkeypatch.setattr(cut_log, "RULES_VERSION", cut_log.RULES_VERSION + 1)
+    monkeypatch.setattr(McapLog, "messages", lambda *args, **options: pytest.fail("read again"))
+    with pytest.raises(pytest.fail.Exception, match="read again"):
+        ingest(log, tmp_path / "data", task(BY_VALUE))
+
+
+def test_times_that_the_index_does_not_tell_are_read_without_decoding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = write_session(tmp_path / "run.mcap")
+    expected = preview(log, task(GAP))[0]
+    monkeypatch.setattr(McapLog, "message_times", lambda log: ({}, True))
+    monkeypatch.setattr(McapLog, "decoded", lambda *args: pytest.fail("decoded"))
+    found = preview(log, task(GAP))[0]
+    assert [(cut.name, cut.duration_s) for cut in found] == [(cut.name, cut.duration_s) for cut in expected]
+    assert [cut.messages for cut in found] == [None] * 3
 
 
 def test_one_more_range_adds_one_episode_and_a_changed_one_replaces_its_own(tmp_path: Path) -> None:
@@ -226,6 +288,7 @@ def test_demonstrations_that_a_log_tells_apart_are_cut_further_and_never_joined(
         ("episode_000-at-00001.000s", 0.2),
         ("episode_001-at-00001.000s", 0.3),
     ]
-    assert "1 of 3 ranges lie outside" in notes[0]
+    assert "reaching outside the log's 2.1 s of 2 demonstrations" not in notes[0]
+    assert "outside the log's 2.1 s of 2 demonstrations, and left out: " in notes[0]
     assert names == ["episode_000-at-00000.000s", "episode_001-at-00001.200s"]
     assert len(ingest(store.path, tmp_path / "data", spec).written) == 2

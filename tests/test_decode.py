@@ -191,6 +191,16 @@ def test_exif_orientation_is_ignored() -> None:
     assert np.array_equal(decode_image(compressed(turned)), decode_image(compressed(data)))
 
 
+def test_the_end_of_a_thumbnail_is_not_the_end_of_the_picture() -> None:
+    data = encode_image(colour_card(), "jpeg")
+    thumbnail = b"Exif\0\0" + encode_image(colour_card(16, 16), "jpeg")
+    whole = data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(thumbnail)) + thumbnail + data[2:]
+    assert np.array_equal(decode_image(compressed(whole)), decode_image(compressed(data)))
+    for size in (40, 4 + len(thumbnail), len(whole) // 2, len(whole) - 40):
+        with pytest.raises(DecodeError, match="cut off"):
+            decode_image(compressed(whole[:size]))
+
+
 def test_a_sixteen_bit_png_is_refused() -> None:
     def part(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
@@ -316,7 +326,9 @@ def test_slices_of_arrays_and_lists_agree_with_python(values: list[float], data:
         (["list[3:3]"], "outside"),
         (["pose[0]"], "only lists"),
         (["pose..x"], "cannot be understood"),
-        (["list[-1]"], "cannot be understood"),
+        (["list[-5]"], "outside"),
+        (["list[-3:2]"], "outside"),
+        (["list[+1]"], "cannot be understood"),
         (["list[1:"], "cannot be understood"),
         ([".pose"], "cannot be understood"),
     ],

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from tests.synthetic import colour_card, encode_image
 from vilp_data import limits
-from vilp_data.decode.depth import decode_depth, depth_levels, is_depth, level_metres
+from vilp_data.decode.depth import decode_depth, depth_levels, is_depth, is_grey16, level_metres
 from vilp_data.decode.images import decode_image
 from vilp_data.decode.rvl import unpack_rvl
 from vilp_data.errors import DecodeError, UsageError
@@ -94,7 +94,7 @@ def metres(image: U16) -> npt.NDArray[np.float32]:
 @pytest.mark.parametrize(("big", "padding"), [(False, 0), (True, 0), (False, 6), (True, 3)])
 def test_raw_millimetres_are_read_in_either_byte_order(schema: str, encoding: str, big: bool, padding: int) -> None:
     message = raw(ramp(), encoding, big=big, padding=padding, schema=schema)
-    assert is_depth(message)
+    assert (is_depth(message), is_grey16(message)) == (encoding == "16UC1", encoding == "mono16")
     np.testing.assert_allclose(decode_depth(message, MM), metres(ramp()), rtol=1e-6)
 
 
@@ -123,7 +123,13 @@ def test_the_unit_is_the_one_that_the_task_states() -> None:
 def test_compressed_millimetres_are_exact(said: str, data: bytes) -> None:
     message = compressed(data, said)
     np.testing.assert_allclose(decode_depth(message, MM), metres(ramp()), rtol=1e-6)
-    assert is_depth(message) == ("compressedDepth" in said)
+    assert (is_depth(message), is_grey16(message)) == (said != "png", said == "png")
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png"])
+def test_a_picture_is_neither_depth_nor_grey_of_16_bits(kind: Any) -> None:
+    for message in (compressed(encode_image(colour_card(), kind), kind), compressed(b"torn", kind)):
+        assert (is_depth(message), is_grey16(message)) == (False, False)
 
 
 @pytest.mark.parametrize("codec", ["png", "rvl"])
@@ -256,6 +262,22 @@ def test_a_missing_reading_is_not_averaged_into_a_distance() -> None:
     assert fit_depth(block, 1, 1, None)[0, 0] == pytest.approx(4 / 3)
     mostly_missing = np.array([[1.0, np.nan], [np.nan, np.nan]], np.float32)
     assert np.isnan(fit_depth(mostly_missing, 1, 1, None)[0, 0])
+
+
+@pytest.mark.parametrize(("height", "width"), [(6, 6), (8, 16), (4, 6)])
+def test_a_depth_image_that_grows_repeats_readings_in_their_place_and_makes_none_up(height: int, width: int) -> None:
+    step = np.full((4, 4), 0.6, np.float32)
+    step[:, 2:] = 2.9
+    step[1, 1] = np.nan
+    rows = ((np.arange(height) + 0.5) * 4 / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * 4 / width).astype(int)
+    np.testing.assert_array_equal(fit_depth(step, height, width, "stretch"), step[np.ix_(rows, columns)])
+
+
+def test_a_side_of_a_depth_image_that_shrinks_is_averaged_whatever_the_other_does() -> None:
+    ramp = np.tile(np.arange(64, dtype=np.float32), (4, 1))
+    means = np.arange(8, dtype=np.float32) * 8 + 3.5
+    np.testing.assert_allclose(fit_depth(ramp, 8, 8, "stretch"), np.tile(means, (8, 1)))
 
 
 def test_crop_keeps_the_middle_and_padding_has_no_reading() -> None:

@@ -11,8 +11,9 @@ import pytest
 from av.video.reformatter import ColorRange, Colorspace
 
 from tests.synthetic import colour_card
-from tests.video_packets import ENCODERS, GROUP, Encoded, encode, number_of, numbered_frames, video_message
-from vilp_data.decode.video import BEFORE_KEYFRAME, RgbReader, VideoDecoder, is_video, packet_of, video_codec
+from tests.video_packets import ENCODERS, GROUP, Encoded, encode, number_of, numbered_frames, parted, video_message
+from vilp_data.decode.video import BEFORE_KEYFRAME, LATE, RgbReader, VideoDecoder
+from vilp_data.decode.video_packet import is_video, packet_of, video_codec
 from vilp_data.errors import DecodeError
 from vilp_data.types import U8, Message
 
@@ -37,6 +38,12 @@ def decoded(messages: Sequence[Message], *, first: int = 0) -> tuple[dict[int, U
 
 def messages_of(name: str, sent: Sequence[Encoded]) -> list[Message]:
     return [video_message(packet.data, name, number=number) for number, packet in enumerate(sent)]
+
+
+def without_parameters(name: str, sent: Encoded) -> tuple[Message, Message]:
+    """A keyframe's packet as two messages: its parameters, and the rest."""
+    kept = packet_of(video_message(sent.data, name)).parameters.values()
+    return tuple(video_message(data, name) for data in parted(sent.data, kept))  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -85,11 +92,9 @@ def test_frames_made_of_a_torn_one_are_lost_up_to_the_next_keyframe(name: str) -
     torn = keys[1] + 3
     sent[torn] = Encoded(sent[torn].shows, sent[torn].data[: len(sent[torn].data) // 2], False)
     found, decoder = decoded(messages_of(name, sent))
-    smeared = decoder.smeared()
-    assert torn in decoder.lost
-    assert set(smeared) | {torn} == set(range(torn, keys[2]))
-    whole = {number: number_of(frame) for number, frame in found.items() if number not in decoder.lost}
-    assert whole == {n: n for n in range(FRAMES) if not torn <= n < keys[2]}
+    assert sorted(decoder.lost) == list(range(torn, keys[2]))
+    assert all(str(10**9 + n * 10**8) in str(error.where) for n, error in decoder.lost.items())
+    assert {n: number_of(frame) for n, frame in found.items()} == {n: n for n in range(FRAMES) if n not in decoder.lost}
 
 
 def test_a_lost_frame_that_no_other_refers_to_costs_only_itself() -> None:
@@ -97,9 +102,67 @@ def test_a_lost_frame_that_no_other_refers_to_costs_only_itself() -> None:
     sent = list(packets(name))
     number = next(n for n, p in enumerate(sent) if n > GROUP and not packet_of(video_message(p.data, name)).referred)
     sent[number] = Encoded(sent[number].shows, sent[number].data[:12], False)
-    _, decoder = decoded(messages_of(name, sent))
-    assert decoder.smeared() == []
+    found, decoder = decoded(messages_of(name, sent))
     assert list(decoder.lost) == [number]
+    assert sorted(found) == [n for n in range(FRAMES) if n != number]
+
+
+@pytest.mark.parametrize("name", ["h264 with B frames", "h265 with B frames"])
+def test_frames_come_in_the_order_in_which_they_are_shown(name: str) -> None:
+    found, _ = decoded(messages_of(name, packets(name)))
+    assert [number_of(frame) for frame in found.values()] == list(range(FRAMES))
+
+
+def test_b_frames_made_of_a_lost_picture_are_lost_though_they_are_shown_before_it() -> None:
+    """A picture is cut within its data: the decoder tells only with its frame, when those made of it are shown already."""
+    name = "h264 with B frames"
+    sent = list(packets(name))
+    torn = next(n for n, p in enumerate(sent) if n > GROUP + 1 and not p.keyframe and p.shows > n)
+    sent[torn] = Encoded(sent[torn].shows, sent[torn].data[: len(sent[torn].data) // 2], False)
+    found, decoder = decoded(messages_of(name, sent))
+    following = next(n for n, p in enumerate(sent) if n > torn and p.keyframe)
+    assert sorted(decoder.lost) == list(range(torn, following))
+    assert sorted(found) == [n for n in range(FRAMES) if not torn <= n < following]
+
+
+@pytest.mark.parametrize("name", ["h264", "h265"])
+def test_parameters_that_travel_alone_are_no_picture_and_lose_none(name: str) -> None:
+    sent = packets(name)
+    alone, bare = without_parameters(name, sent[0])
+    for message, picture in ((alone, False), (bare, True)):
+        packet = packet_of(message)
+        assert packet.picture is picture
+        assert packet.keyframe is picture
+        assert packet.described is not picture
+    in_mid_group = messages_of(name, sent)
+    in_mid_group.insert(GROUP + 5, alone)
+    found, decoder = decoded([alone, bare, *in_mid_group[1:]])
+    assert decoder.lost == {}
+    assert [number_of(frame) for frame in found.values()] == list(range(FRAMES))
+
+
+@pytest.mark.parametrize("name", ["h264", "h265"])
+def test_a_decoder_that_is_given_the_parameters_begins_at_a_keyframe_without_them(name: str) -> None:
+    first = packets(name)[0]
+    _, bare = without_parameters(name, first)
+    found, decoder = decoded([bare])
+    assert not found
+    assert list(decoder.lost) == [0]
+    decoder = VideoDecoder(packet_of(video_message(first.data, name)).parameters)
+    frames = [*decoder.feed(0, bare), *decoder.rest()]
+    assert [number for number, _ in frames] == [0]
+
+
+def test_nothing_but_what_is_lost_is_kept_of_a_long_stream() -> None:
+    messages, decoder = messages_of("h264", packets("h264")), VideoDecoder()
+    shown = 0
+    for number in range(40 * FRAMES):
+        shown += sum(1 for _ in decoder.feed(number, messages[number % FRAMES]))
+    assert shown > 39 * FRAMES
+    assert decoder.lost == {}
+    kept = [value for value in vars(decoder).values() if hasattr(value, "__len__") and not isinstance(value, str)]
+    assert kept
+    assert max(map(len, kept)) <= LATE + 1
 
 
 # --- colour -----------------------------------------------------------------------------------------------------------------

@@ -101,8 +101,10 @@ def test_spans_by_value_never_overlap_and_hold_true_values_only(values: list[obj
 def test_ranges_are_seconds_from_the_start_or_absolute_nanoseconds() -> None:
     text = "start, end, name, success, object\n1.5, 4, first, yes, cup\n10,20,,no,\n"
     one, two = spans_of_rows(read_ranges(text, where="r.csv"), "run.mcap", start_ns=7 * S)
-    assert one == Span(8_500_000_000, 11 * S, {"object": "cup", "success": "true", CUT_TAG: "1.5-4 s"}, "first")
-    assert two == Span(17 * S, 27 * S, {"success": "false", CUT_TAG: "10-20 s"}, None)
+    assert one == Span(
+        8_500_000_000, 11 * S, {"object": "cup", "success": "true", CUT_TAG: "1.5-4 s"}, "first", 8_500_000_000
+    )
+    assert two == Span(17 * S, 27 * S, {"success": "false", CUT_TAG: "10-20 s"}, None, 17 * S)
     absolute = "start_ns,end_ns\n1700000000000000000,1700000001000000000\n"
     (span,) = spans_of_rows(read_ranges(absolute, where="r.csv"), "run.mcap", start_ns=7 * S)
     assert (span.start_ns, span.end_ns) == (1700000000 * S, 1700000001 * S)
@@ -123,6 +125,10 @@ def test_a_ranges_file_may_be_of_many_logs() -> None:
     [
         ("", "needs a header line"), ("begin,end\n1,2\n", "columns start and end"), ("start,end\n", "without ranges"),
         ("start,end\n1,x\n", "r.csv, line 2: end is no number"), ("start,end\n0,1\n5,5\n", "line 3: a range must end after it starts"),
+        ("start,end\n0,nan\n", "end is no number"), ("start,end\nnan,1\n", "start is no number"),
+        ("start,end\n0,inf\n", "end is no number"), ("start,end\n0,1e999\n", "end is no number"),
+        (f"start_ns,end_ns\n0,{10**30}\n", "end_ns is no number"),
+        (f"start,end\n5,{17 * 10**17}\n", "not of one kind"), ("start,end\n0,1e16\n", "not of one kind"),
         ("start,end,success\n1,2,maybe\n", "success is true or false"), ("start_ns,end_ns\n1.5,2\n", "whole nanoseconds"),
     ],
 )  # fmt: skip
@@ -147,6 +153,14 @@ def test_one_more_cut_renames_no_other() -> None:
     before = [found.name for found in named(spans, WHOLE, log="run.mcap", start_ns=0, alone=True)]
     after = [found.name for found in named([*spans, Span(0, S)], WHOLE, log="run.mcap", start_ns=0, alone=True)]
     assert after[1:] == before
+
+
+def test_cuts_that_begin_in_one_millisecond_have_names_of_their_own_and_the_first_keeps_its() -> None:
+    starts = [1_500_000_000, 1_500_200_000, 1_500_200_001, 1_501_000_000]
+    names = [
+        found.name for found in named([Span(t, 9 * S) for t in starts], WHOLE, log="run.mcap", start_ns=0, alone=True)
+    ]
+    assert names == ["at-00001.500s", "at-00001.500200s", "at-00001.500200001s", "at-00001.501s"]
 
 
 def test_two_ranges_of_one_name_are_refused() -> None:

@@ -8,18 +8,21 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.export_datasets import SPEC, demonstration, plain_dataset, shown, write
-from tests.faults import tree
+from tests.faults import run_until_killed, tree
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import SplitError, StoreError, UsageError
+from vilp_data.errors import SpecError, SplitError, StoreError, UsageError
 from vilp_data.export import Choice, export_dataset
 from vilp_data.export.folder import out_folder
+from vilp_data.export.segments import Segment, common_rate_hz
 from vilp_data.ingest import ingest_logs
 from vilp_data.spec import task_from_dict
 
@@ -145,6 +148,51 @@ def test_the_manifest_tells_where_everything_came_from(tmp_path: Path) -> None:
     assert set(manifest["sha256"]) == set(tree(tmp_path / "out")) - {"export.json"}
 
 
+# --- rates ---------------------------------------------------------------------------------------------------------------
+
+
+def at_rates(root: Path, *rates: float) -> list[Any]:
+    """Episodes of a task that states no rate: each has that of its own camera."""
+    episodes = []
+    for number, rate_hz in enumerate(rates):
+        one = demonstration(f"run{number}", 8 + number)
+        ticks = np.round(np.arange(one.n_steps) * 1e9 / rate_hz).astype(np.int64) + 7
+        episodes.append(replace(one, rate_hz=rate_hz, log_time_ns=ticks))
+    spec = {name: value for name, value in SPEC.items() if name != "rate_hz"}
+    write(root, *episodes, spec=spec)
+    return episodes
+
+
+@pytest.mark.parametrize("to", ALL)
+def test_rates_that_scatter_as_cameras_do_are_one_rate_and_the_true_times_are_kept(tmp_path: Path, to: str) -> None:
+    episodes = at_rates(tmp_path / "data", 9.96, 10.06, 9.97)
+    report = export_dataset(tmp_path / "data", tmp_path / "out", to, images="lossless" if to == "lerobot" else None)
+    assert report.rate_hz == 10
+    assert "9.96 to 10.06 Hz" in report.not_carried["the rate of each episode"]
+    again = ingested_again(tmp_path / "out", to, tmp_path / "again")
+    for before, after in zip(episodes, again, strict=True):
+        assert np.array_equal(after.action, before.action)
+        assert np.array_equal(shown(after, "front"), shown(before, "front"))
+    listed = json.loads((tmp_path / "out" / "export.json").read_text())["episode_list"]
+    assert [one["rate_hz"] for one in listed] == [9.96, 10.06, 9.97]
+
+
+def test_the_rate_is_the_roundest_of_those_there_are() -> None:
+    def rate(*rates: float) -> float:
+        return common_rate_hz([Segment(SimpleNamespace(rate_hz=one), 0, 2, None) for one in rates])  # type: ignore[arg-type]
+
+    assert rate(29.97002997) == 29.97002997
+    assert rate(29.97, 30.02) == 30
+    assert rate(14.981, 14.992, 14.987) == 14.99
+    assert rate(9.8, 10, 10.2) == 10  # as far apart as an ingest at 10 Hz lets them be
+
+
+def test_rates_too_far_apart_for_one_dataset_are_refused(tmp_path: Path) -> None:
+    at_rates(tmp_path / "data", 9.5, 10.0)
+    with pytest.raises(SpecError, match="different rates"):
+        export_dataset(tmp_path / "data", tmp_path / "out", "robomimic")
+
+
 # --- nothing half, nothing lost ------------------------------------------------------------------------------------------
 
 
@@ -259,6 +307,31 @@ def test_what_a_killed_export_left_is_cleared_away_by_the_next(tmp_path: Path) -
     export_dataset(tmp_path / "data", tmp_path / "out", "robomimic")
     assert not (tmp_path / "out" / "half.hdf5").exists()
     assert not leftover.exists()
+
+
+REPLACE = """
+import sys
+from pathlib import Path
+from vilp_data.export import export_dataset
+export_dataset(Path(sys.argv[1]), Path(sys.argv[2]), "robomimic", licence="MIT", force=True)
+"""
+MOMENTS = 15  # fsyncs and renames of such an export; the 13th is the rename between the two
+
+
+@pytest.mark.parametrize("nth", [pytest.param(n, marks=() if n == 13 else pytest.mark.slow) for n in range(1, 17)])
+def test_an_export_killed_while_it_replaces_another_leaves_one_of_them_whole(tmp_path: Path, nth: int) -> None:
+    plain_dataset(tmp_path / "data")
+    export_dataset(tmp_path / "data", tmp_path / "new", "robomimic", licence="MIT")
+    export_dataset(tmp_path / "data", tmp_path / "out", "robomimic")
+    new, old = tree(tmp_path / "new"), tree(tmp_path / "out")
+    killed = run_until_killed(REPLACE, [str(tmp_path / "data"), str(tmp_path / "out")], nth=nth)
+    assert killed == (nth <= MOMENTS)
+    with pytest.raises(UsageError, match="there is an export already"):  # whichever of them it is
+        export_dataset(tmp_path / "data", tmp_path / "out", "robomimic")
+    assert tree(tmp_path / "out") in (new, old)
+    export_dataset(tmp_path / "data", tmp_path / "out", "robomimic", licence="MIT", force=True)
+    assert tree(tmp_path / "out") == new
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "new", "out"]
 
 
 @pytest.mark.parametrize(

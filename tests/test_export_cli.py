@@ -82,3 +82,18 @@ def test_the_folder_of_an_export_is_found_as_one_log(tmp_path: Path) -> None:
         (path,) = find_logs([tmp_path / to]).logs
         with open_log(path) as log:
             assert len(log.episodes()) == 3
+
+
+def test_a_card_never_replaces_a_page_that_somebody_wrote(tmp_path: Path) -> None:
+    plain_dataset(tmp_path / "data/arm")
+    page = tmp_path / "data/arm" / "README.md"
+    invoke("card", "data/arm", "--licence", "MIT")
+    invoke("card", "data/arm", "--licence", "CC0-1.0")  # its own page it may
+    assert "license: cc0-1.0" in page.read_text()
+    page.write_text("MY NOTES")
+    with pytest.raises(VilpDataError, match="-o") as raised:
+        invoke("card", "data/arm")
+    assert raised.value.exit_code == 2
+    assert page.read_text() == "MY NOTES"
+    invoke("card", "data/arm", "--force")
+    assert page.read_text().startswith("---")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,15 @@ import pytest
 
 from tests.export_datasets import HEIGHT, SPEC, WIDTH, demonstration, plain_dataset, shown, write
 from tests.synthetic import card_frame, psnr
+from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.export import export_dataset, lerobot
 from vilp_data.export.lerobot_stats import image_stats, pixel_counts, vector_stats
 from vilp_data.export.video import CODINGS, VideoWriter, frame_rate, read_video
+from vilp_data.ingest import ingest_logs
+from vilp_data.sources import open_log
+from vilp_data.sources.lerobot_log import LeRobotLog
+from vilp_data.spec import task_from_dict
 
 FRONT = "videos/observation.images.front/chunk-000/file-000.mp4"
 
@@ -137,6 +143,42 @@ def test_files_are_begun_anew_at_their_limits(tmp_path: Path, monkeypatch: pytes
     assert (tmp_path / "out" / "data/chunk-001/file-000.parquet").is_file()
 
 
+@pytest.mark.parametrize("rate_hz", [10.0, 30000 / 1001, 12.5])
+def test_our_own_reader_finds_the_same_steps_in_every_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate_hz: float
+) -> None:
+    """Several files of each kind, a rate that is no whole number: the reader knows nothing of the writer, and ingests what was stored."""
+    ticks = [np.round(np.arange(n) * 1e9 / rate_hz).astype(np.int64) for n in (14, 9, 11)]
+    episodes = [
+        replace(demonstration(name, len(times)), rate_hz=rate_hz, log_time_ns=times)
+        for name, times in zip(("pick", "place", "put"), ticks, strict=True)
+    ]
+    write(tmp_path / "data", *episodes, spec={**SPEC, "rate_hz": rate_hz})
+    monkeypatch.setattr(lerobot, "VIDEO_FILE_MB", 0)
+    monkeypatch.setattr(lerobot, "DATA_FILE_MB", 0)
+    export_dataset(tmp_path / "data", tmp_path / "out", "lerobot", images="lossless")
+    assert len(list((tmp_path / "out/videos").rglob("*.mp4"))) == 6
+    with open_log(tmp_path / "out") as log:
+        assert isinstance(log, LeRobotLog)
+        assert len(log.episodes()) == 3
+    table = {
+        "name": "again", "rate_hz": rate_hz,
+        "views": {v: {**t, "clock": "log", "topic": f"observation.images.{v}"} for v, t in SPEC["views"].items()},
+        "low_dim": {"state": {"topic": "observation.state", "clock": "log"}},
+        "action": {"target": {"topic": "action", "clock": "log"}},
+    }  # fmt: skip
+    report = ingest_logs([tmp_path / "out"], tmp_path / "again", task_from_dict(table, where="test"), workers=1)
+    assert not report.failed
+    store = EpisodeStore(tmp_path / "again")
+    for before, entry in zip(episodes, store.index(), strict=True):
+        after = store.read(entry.id)
+        assert np.abs(np.diff(after.log_time_ns) - np.diff(before.log_time_ns)).max() <= 1
+        assert np.array_equal(after.low_dim, before.low_dim)
+        assert np.array_equal(after.action, before.action)
+        for view in SPEC["views"]:
+            assert np.array_equal(shown(after, view), shown(before, view))
+
+
 def test_frames_that_slipped_by_one_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "data", demonstration("slip", 20))
     honest = VideoWriter.append
@@ -152,8 +194,6 @@ def test_frames_that_slipped_by_one_are_found(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_depth_view_is_never_coded_with_loss(tmp_path: Path) -> None:
-    from dataclasses import replace
-
     one = demonstration("deep", 8)
     frames = {**one.frames, "side": one.frames["side"][..., :1]}
     depth = {"unit": "mm", "near_m": 0.2, "far_m": 1.5}

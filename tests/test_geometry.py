@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -39,6 +40,22 @@ def test_halving_averages_blocks_of_pixels() -> None:
     image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     mean = image.reshape(20, 2, 30, 2, 3).mean(axis=(1, 3))
     assert np.abs(fit_image(image, 20, 30, None) - mean).max() <= 0.5
+
+
+@pytest.mark.parametrize(("height", "width"), [(96, 8), (64, 8), (32, 8)])
+def test_a_side_that_shrinks_is_averaged_whatever_the_other_does(height: int, width: int) -> None:
+    stripes = np.zeros((64, 64, 3), np.uint8)
+    stripes[:, ::8] = 240
+    assert (fit_image(stripes, height, width, "stretch") == 30).all()
+    assert (fit_image(stripes.swapaxes(0, 1), width, height, "stretch") == 30).all()
+
+
+def test_an_image_that_grows_is_interpolated_and_one_that_shrinks_is_not_changed_by_it() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(fit_image(image, 30, 40, None), cv2.resize(image, (40, 30)))
+    np.testing.assert_array_equal(
+        fit_image(image, 9, 12, None), cv2.resize(image, (12, 9), interpolation=cv2.INTER_AREA)
+    )
 
 
 def test_cropping_keeps_the_middle_and_padding_keeps_the_whole() -> None:

@@ -15,7 +15,6 @@ from tests import synthetic
 from tests.faults import kill_moments, run_until_files, run_until_killed, tree
 from tests.synthetic import task_spec, write_mcap, write_zarr, zarr_task_spec
 from tests.synthetic_bags import write_rosbag1, write_rosbag2
-from vilp_data import shards
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, StoreError, UsageError
 from vilp_data.ingest import IngestReport, ingest_logs
@@ -23,6 +22,7 @@ from vilp_data.sources.mcap_log import McapLog
 from vilp_data.spec import TaskSpec, load_task
 from vilp_data.staleness import stale_episodes
 from vilp_data.types import Episode
+from vilp_data.writer_lock import writer_lock
 
 
 def ingest(logs: list[Path], root: Path, spec: TaskSpec, *, include_failures: bool = False) -> IngestReport:
@@ -255,7 +255,7 @@ def test_a_data_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
 
 def test_ingest_while_another_process_writes_is_refused(tmp_path: Path) -> None:
     log = write_mcap(tmp_path / "run.mcap")
-    with shards.writer_lock(tmp_path / "data"), pytest.raises(BusyError):
+    with writer_lock(tmp_path / "data"), pytest.raises(BusyError):
         ingest([log.path], tmp_path / "data", task_spec(log))
 
 
@@ -532,6 +532,15 @@ def test_a_dataset_of_another_format_version_is_refused(tmp_path: Path) -> None:
         EpisodeStore(tmp_path / "data").spec()
 
 
+def test_what_a_killed_ingest_left_half_written_goes_with_the_next(tmp_path: Path) -> None:
+    log, root = write_mcap(tmp_path / "run.mcap"), tmp_path / "data"
+    half = root / "episodes" / "frames" / "front" / ".run.safetensors.1.tmp"
+    half.parent.mkdir(parents=True)
+    half.write_bytes(b"half")
+    ingest([log.path], root, task_spec(log))
+    assert not half.exists()
+
+
 # --- killed at any moment ------------------------------------------------------------------------------------------------
 
 INGEST = """
@@ -576,7 +585,7 @@ def test_two_workers_killed_and_run_again_give_the_bytes_of_one(tmp_path: Path, 
     )
     killed = tmp_path / "killed"
     assert run_until_files(TWO_WORKERS, [str(logs), str(killed), str(task)], folder=killed, count=count)
-    with shards.writer_lock(killed):  # whoever could still write is gone
+    with writer_lock(killed):  # whoever could still write is gone
         after = tree(killed)
     spec = load_task(str(task))
     report = ingest_logs([logs], killed, spec, workers=2)

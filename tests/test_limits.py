@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import random
 import struct
+import tracemalloc
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +21,12 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from tests.damage import LAYOUTS, write_log
+from tests.damage import salvaged, write_log
 from tests.synthetic import write_mcap
 from vilp_data import limits
 from vilp_data.errors import LogError, UsageError, VilpDataError
 from vilp_data.salvage import salvage_log
-from vilp_data.sources import inflate, open_log
+from vilp_data.sources import inflate, mcap_clean, open_log
 
 # --- names ------------------------------------------------------------------------------------------------------------
 
@@ -98,43 +101,85 @@ def test_what_is_no_limit_is_refused(said: str) -> None:
 def test_a_log_above_a_limit_is_read_once_the_limit_that_the_error_names_is_raised(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "run.mcap"
-    write_log(path, n=300, **LAYOUTS["one zstd chunk"])
+    path = write_mcap(tmp_path / "run.mcap").path
 
     def count() -> int:
         with open_log(path) as log:
-            return sum(1 for _ in log._file.messages(log._file.index.channels, 0, 1 << 62))  # type: ignore[attr-defined]
+            return sum(1 for _ in log.messages([topic.name for topic in log.topics()]))
 
-    monkeypatch.setattr(limits, "CHUNK_BYTES", 10_000)
+    sent = count()
+    monkeypatch.setattr(limits, "CHUNK_BYTES", 1000)
     with pytest.raises(LogError, match=r"set VILP_MAX_CHUNK_BYTES=(\d+)") as refused:
         count()
     monkeypatch.setattr(limits, "CHUNK_BYTES", int(str(refused.value.remedy).rpartition("=")[2]))
-    assert count() == 300
+    assert count() == sent
 
 
 # --- inflating --------------------------------------------------------------------------------------------------------
+
+MOST = 32 << 20
+"""Bytes: what a log of a few kB may make a test hold."""
+
+
+@contextmanager
+def holding_less_than(most: int) -> Iterator[None]:
+    """The block never holds more than `most` bytes at a time."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+def bomb(size: int) -> bytes:
+    """A zstd frame of `size` zeros, which never says how many: a few kB for gigabytes."""
+    stream = zstandard.ZstdCompressor(level=1).compressobj()
+    block = bytes(1 << 20)
+    return b"".join([*(stream.compress(block) for _ in range(size >> 20)), stream.flush()])
+
 
 PACKERS: dict[str, Callable[[bytes], bytes]] = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 
 
 @pytest.mark.parametrize("compression", PACKERS)
 def test_a_chunk_inflates_to_no_more_than_it_claims(compression: str) -> None:
-    bomb = PACKERS[compression](bytes(50_000_000))
-    assert len(bomb) < 250_000
-    with pytest.raises(ValueError, match=r"1000|Destination"):
-        inflate.inflate(bomb, compression, 1000)
-    assert len(inflate.inflate_prefix(bomb, compression, 1000).data) == 1000
+    packed = PACKERS[compression](bytes(50_000_000))
+    assert len(packed) < 250_000
+    with holding_less_than(2 << 20), pytest.raises(ValueError, match=r"1000|Destination"):
+        inflate.inflate(packed, compression, 1000)
+    with holding_less_than(2 << 20):
+        assert len(inflate.inflate_prefix(packed, compression, 1000).data) == 1000
+
+
+@pytest.mark.parametrize("compression", PACKERS)
+@pytest.mark.parametrize("less", [1, 100, 131_072])
+def test_a_chunk_that_inflates_to_more_than_it_claims_is_faulty_however_little_more(
+    compression: str, less: int
+) -> None:
+    packed = PACKERS[compression](random.Random(0).randbytes(300_000))
+    found = inflate.inflate_prefix(packed, compression, 300_000 - less)
+    assert "more than" in found.fault
+    assert len(found.data) == 300_000 - less
+
+
+def test_what_comes_out_is_held_once() -> None:
+    for compression, packed in (("zstd", bomb(64 << 20)), ("lz4", lz4.frame.compress(bytes(64 << 20)))):
+        with holding_less_than(80 << 20):
+            assert len(inflate.inflate_prefix(packed, compression, 64 << 20).data) == 64 << 20
 
 
 @pytest.mark.parametrize("compression", PACKERS)
 def test_a_claim_of_terabytes_allocates_nothing(compression: str) -> None:
-    """The claim is in the chunk's header and in the compressed frame's own."""
-    packed = bytearray(PACKERS[compression](b"hello " * 100))
-    if compression == "lz4":
+    """The claim is in the chunk's header and in the compressed frame's own. Half a gigabyte could be had, and would be seen here."""
+    for claim in (1 << 29, 1 << 45):
         packed = bytearray(lz4.frame.compress(b"hello " * 100, store_size=True))
-        packed[6:14] = struct.pack("<Q", 1 << 45)
-    with pytest.raises(ValueError, match=r"\S"):
-        inflate.inflate(bytes(packed), compression, 1 << 45)
+        packed[6:14] = struct.pack("<Q", claim)
+        if compression == "zstd":  # eight bytes of content size, no checksum, a window of 1 MB
+            packed = bytearray(b"\x28\xb5\x2f\xfd" + bytes([0b11000000, 10 << 3]) + struct.pack("<Q", claim))
+            packed += bytes([0b00000001 | 600 << 3 & 0xFF, 600 >> 5, 0]) + b"hello " * 100
+        with holding_less_than(4 << 20), pytest.raises(ValueError, match=r"\S"):
+            inflate.inflate(bytes(packed), compression, claim)
 
 
 def test_a_huge_zstd_window_is_refused() -> None:
@@ -193,8 +238,55 @@ def test_a_chunk_that_claims_terabytes_is_refused_in_words(tmp_path: Path) -> No
     path = unindexed(tmp_path / "run.mcap", chunk_that_claims(1 << 42, zstandard.compress(b"x")))
     with pytest.raises(LogError, match=r"claims more than any recorder writes(.|\n)*VILP_MAX_CHUNK_BYTES"):
         open_log(path)
-    with pytest.raises(LogError):
+    with holding_less_than(MOST), pytest.raises(LogError):
         salvage_log(path, tmp_path / "out.mcap")
+
+
+def test_a_chunk_that_inflates_to_far_more_than_its_wrong_size_costs_salvage_little(tmp_path: Path) -> None:
+    """Its size may be what is damaged, so a larger one is tried; 10 kB are not believed to have been 256 MB."""
+    record, path = chunk_that_claims(100, bomb(256 << 20)), tmp_path / "run.mcap"
+    assert len(record) < 50_000
+    write_mcap(path)
+    content = path.read_bytes()
+    begin = 17 + struct.unpack_from("<Q", content, 9)[0]
+    path.write_bytes(content[:begin] + record + content[begin:])
+    with holding_less_than(100 << 20):
+        salvage_log(path, tmp_path / "out.mcap")
+    with open_log(tmp_path / "out.mcap") as log:
+        assert sum(topic.message_count or 0 for topic in log.topics()) > 100
+
+
+def test_a_damaged_size_of_a_large_chunk_is_still_made_good(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    sent = write_log(path, n=300, extras=False, compression=CompressionType.ZSTD, chunk_size=1 << 30)
+    content = bytearray(path.read_bytes())
+    begin = 17 + struct.unpack_from("<Q", content, 9)[0]
+    assert content[begin] == Opcode.CHUNK
+    content[begin + 25 : begin + 33] = struct.pack("<Q", 5000)
+    found, report = salvaged(path, bytes(content))
+    assert found == sent
+    assert report is not None
+    assert (report.complete, report.whole) == (True, False)
+
+
+def test_a_channel_that_is_described_anew_without_end_is_refused_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each description gives one id another meaning, and a message of it follows: there are 65,535 ids."""
+
+    def record(opcode: int, body: bytes) -> bytes:
+        return struct.pack("<BQ", opcode, len(body)) + body
+
+    def channel(number: int) -> bytes:
+        topic = b"/t%d" % number
+        body = struct.pack("<HHI", 1, 0, len(topic)) + topic + struct.pack("<I", 4) + b"json" + struct.pack("<I", 0)
+        return record(Opcode.CHANNEL, body) + record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, number, 0) + b"{}")
+
+    path = unindexed(tmp_path / "run.mcap", *(channel(number) for number in range(200)))
+    assert salvage_log(path, tmp_path / "out.mcap").recovered == 200
+    monkeypatch.setattr(mcap_clean, "HIGHEST_ID", 100)
+    with pytest.raises(LogError, match="more channels"):
+        salvage_log(path, tmp_path / "out.mcap", force=True)
 
 
 def test_a_record_above_the_limit_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,8 +358,9 @@ HOSTILE = {
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_hostile_message_or_definition_is_an_error_in_words(tmp_path: Path, case: str) -> None:
     encoding, schema, data = HOSTILE[case]
-    with pytest.raises(VilpDataError) as caught:
-        first(log_of(tmp_path / "run.mcap", encoding, schema, data))
+    path = log_of(tmp_path / "run.mcap", encoding, schema, data)
+    with holding_less_than(MOST), pytest.raises(VilpDataError) as caught:
+        first(path)
     assert caught.value.remedy
 
 
@@ -289,5 +382,19 @@ def test_an_image_that_claims_gigapixels_is_refused_before_it_is_decoded() -> No
     from vilp_data.types import Message
 
     body = {"data": png_that_claims(20_000, 20_000), "format": "png"}
-    with pytest.raises(VilpDataError, match=r"(?i)pixel|larger|claims"):
+    with holding_less_than(MOST), pytest.raises(VilpDataError, match=r"(?i)pixel|larger|claims"):
         decode_image(Message("/t", "sensor_msgs/msg/CompressedImage", 1, 1, body))
+
+
+def test_a_png_whose_part_claims_more_than_the_file_is_not_whole() -> None:
+    """A decoder would allocate what the part claims."""
+    from vilp_data.decode.image_file import image_file
+
+    whole = bytearray(png_that_claims(10, 10))
+    found = image_file(bytes(whole))
+    assert found is not None
+    assert found.whole
+    struct.pack_into(">I", whole, whole.index(b"IDAT") - 4, 1 << 30)
+    found = image_file(bytes(whole))
+    assert found is not None
+    assert not found.whole

@@ -8,6 +8,8 @@ import pytest
 
 from vilp_data.errors import UsageError
 from vilp_data.log_files import find_logs
+from vilp_data.log_hashes import _file_stats
+from vilp_data.sources.folder_hash import folder_sha256, log_files
 
 
 def make(folder: Path, *names: str) -> None:
@@ -66,6 +68,40 @@ def test_metadata_of_something_else_makes_no_bag(tmp_path: Path) -> None:
     make(tmp_path, "run.mcap")
     (tmp_path / "metadata.yaml").write_text("title: my recordings\n")
     assert found(tmp_path) == ["run.mcap"]
+
+
+def test_suffixes_count_in_either_case(tmp_path: Path) -> None:
+    make(tmp_path, "A.MCAP", "b.Bag", "c.BAG.active")
+    assert found(tmp_path) == ["A.MCAP", "b.Bag"]
+    assert [path.name for path in find_logs([tmp_path]).passed_over] == ["c.BAG.active"]
+
+
+def test_linked_folders_are_followed_and_links_that_lead_nowhere_or_back_are_named(tmp_path: Path) -> None:
+    make(tmp_path / "disk", "run.mcap", "deep/er.bag")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "monday").symlink_to(tmp_path / "disk")
+    (tmp_path / "logs" / "tuesday").symlink_to(tmp_path / "unmounted")
+    (tmp_path / "disk" / "deep" / "back").symlink_to(tmp_path / "logs")
+    (tmp_path / "disk" / "deep" / "up").symlink_to(tmp_path / "disk")
+    logs = find_logs([tmp_path / "logs"])
+    assert found(tmp_path / "logs") == ["monday/deep/er.bag", "monday/run.mcap"]
+    assert [path.name for path in logs.passed_over] == ["up", "tuesday"]
+    with pytest.raises(UsageError, match="tuesday"):
+        (tmp_path / "logs" / "monday").unlink()
+        find_logs([tmp_path / "logs"])
+
+
+def test_what_lies_behind_a_link_counts_in_a_log_s_hash(tmp_path: Path) -> None:
+    make(tmp_path / "elsewhere", "deep/0.0")
+    make(tmp_path / "store", ".zgroup")
+    (tmp_path / "store" / "data").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "loop").symlink_to(tmp_path / "store")
+    assert list(log_files(tmp_path / "store")) == [".zgroup", "data/deep/0.0"]
+    before = folder_sha256(tmp_path / "store"), _file_stats(tmp_path / "store")
+    (tmp_path / "elsewhere" / "deep" / "0.0").write_bytes(b"other")
+    after = folder_sha256(tmp_path / "store"), _file_stats(tmp_path / "store")
+    assert before[0] != after[0]
+    assert before[1][0] != after[1][0]
 
 
 def test_unfinished_recordings_are_passed_over_and_named(tmp_path: Path) -> None:

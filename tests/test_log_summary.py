@@ -82,7 +82,7 @@ def test_only_the_first_part_of_a_long_log_is_looked_at_and_said(
 ) -> None:
     log = write_mcap(tmp_path / "run.mcap", chunk_size=2000)
     assert not any("rates" in figure for figure in summarise(log.path).sampled)
-    monkeypatch.setattr("vilp_data.sources.mcap_log.INDEXED_CHUNKS", 2)
+    monkeypatch.setattr("vilp_data.sources.chunked_log.INDEXED_CHUNKS", 2)
     sampled = summarise(log.path).sampled
     assert any("rates and gaps: the first" in figure for figure in sampled)
 
@@ -139,7 +139,7 @@ def test_the_summary_is_plain_data_and_a_readable_table(tmp_path: Path) -> None:
     text = format_summary(summary)
     assert "/camera/front/image" in text
     assert "episode.seed = '3'" in text
-    assert f"the first {log_summary.GLANCE} messages" in text
+    assert f"the first {log_summary.SAMPLED} messages" in text
 
 
 def test_real_log_with_unreadable_topics_is_summarised_with_notes() -> None:

@@ -94,3 +94,7 @@ def test_all_kinds_of_bodies_name_their_members_in_the_order_of_the_schema() -> 
     assert member_names(PoseInFrame()) == ["timestamp", "frame_id", "pose"]
     assert [name for name, _ in set_members(PoseInFrame())] == ["frame_id"]
     assert member_names([1, 2]) == member_names(3.0) == member_names("text") == []
+
+
+def test_how_a_multi_array_lies_is_not_plotted_beside_what_it_holds() -> None:
+    assert series({"layout": {"dim": [], "data_offset": 0}, "data": [1.0, 2.0]}) == {"data": {"0": 1.0, "1": 2.0}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import random
 import struct
 import zlib
@@ -25,7 +26,8 @@ from vilp_data.ingest import ingest_logs
 from vilp_data.log_summary import summarise
 from vilp_data.salvage import SALVAGE_RECORD, salvage_log
 from vilp_data.salvage_report import format_report
-from vilp_data.sources import open_log
+from vilp_data.sources import line_endings, open_log
+from vilp_data.sources.file_bytes import FileBytes
 
 DEFAULT_STEPS, ALL_STEPS = 12, 100
 STEPS = [pytest.param(DEFAULT_STEPS, id="some"), pytest.param(ALL_STEPS, id="every percent", marks=pytest.mark.slow)]
@@ -383,6 +385,21 @@ def test_line_feeds_that_became_pairs_are_turned_back(tmp_path: Path) -> None:
     assert report is not None
     assert report.complete
     assert "turned back" in format_report(report)
+
+
+@pytest.mark.parametrize("block", [1, 2, 7, 1 << 20])
+def test_every_pair_is_turned_back_wherever_it_lies(
+    tmp_path: Path, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(line_endings, "BLOCK", block)
+    content = b"#ROSBAG V2.0\nab\n\n\rc\r\r\n\n"
+    path = tmp_path / "run.bag"
+    path.write_bytes(content.replace(b"\n", b"\r\n"))
+    out = io.BytesIO()
+    with FileBytes(path) as source:
+        what = line_endings.restore(source, out)
+    assert out.getvalue() == content
+    assert "not converted" not in what
 
 
 @pytest.mark.parametrize("layout", ["none", "lz4", "zstd"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,7 +16,8 @@ from typer.testing import CliRunner
 
 from tests.damage import LAYOUTS, read_log, write_log
 from vilp_data.cli import app
-from vilp_data.errors import VilpDataError
+from vilp_data.errors import LogError, VilpDataError, copy_or_salvage
+from vilp_data.sources import open_log
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -59,6 +62,26 @@ def test_json_is_the_whole_report(log: Path) -> None:
     assert report["lost"] is None
 
 
+@pytest.mark.parametrize("name", ["run.mcap", "a run.mcap", "run.mcap.active"])
+def test_the_command_that_errors_advise_works_as_it_stands(log: Path, name: str) -> None:
+    damaged = log.rename(log.with_name(name))
+    damaged.write_bytes(damaged.read_bytes()[:15_000])
+    with pytest.raises(LogError) as caught:
+        open_log(damaged)
+    command = re.search(r"`vilp-data salvage (.*)`", str(caught.value.remedy))
+    assert command is not None
+    code, said = salvage(*shlex.split(command[1]))
+    assert code == 1, said
+    assert read_log(Path(shlex.split(command[1])[-1]))
+
+
+def test_a_packed_log_is_inflated_before_it_is_salvaged() -> None:
+    assert copy_or_salvage(Path("bag/a b.db3.zstd")).endswith(
+        "`zstd -d 'bag/a b.db3.zstd' -o 'bag/a b.db3'` inflates what is there, and "
+        "`vilp-data salvage 'bag/a b.db3' -o 'bag/a b-salvaged.mcap'` takes that"
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
@@ -82,17 +105,34 @@ def test_wrong_use_ends_with_its_code_and_a_remedy(
     assert (log.parent / "there.mcap").read_bytes() == b"precious"
 
 
+INTERRUPTED = """
+import sys, time
+from pathlib import Path
+from vilp_data.cli import main
+from vilp_data.sources.mcap_clean import CleanMcap
+
+folder = sys.argv[1]
+
+def wait(clean):
+    Path(folder, "waiting").touch()
+    time.sleep(60)
+
+CleanMcap.finish = wait
+sys.argv = ["vilp-data", "salvage", f"{folder}/run.mcap", "-o", f"{folder}/out.mcap"]
+main()
+"""
+
+
 def test_ctrl_c_leaves_no_half_written_file(tmp_path: Path) -> None:
-    path, out = tmp_path / "run.mcap", tmp_path / "out.mcap"
-    write_log(path, n=4000, use_chunking=False)
-    code = "import sys; sys.argv[0] = 'vilp-data'; from vilp_data.cli import main; main()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "salvage", str(path), "-o", str(out)], cwd=ROOT, stderr=subprocess.DEVNULL
-    )
+    """It comes when every message is written and the file's end is not."""
+    path = tmp_path / "run.mcap"
+    write_log(path, n=50, use_chunking=False)
+    path.write_bytes(path.read_bytes()[:10_000])
+    process = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(tmp_path)], cwd=ROOT, stderr=subprocess.DEVNULL)
     end = time.monotonic() + 30
-    while not list(tmp_path.glob(".out.mcap.*.tmp")) and process.poll() is None and time.monotonic() < end:
+    while not (tmp_path / "waiting").exists() and process.poll() is None and time.monotonic() < end:
         time.sleep(0.005)
+    assert list(tmp_path.glob(".out.mcap.*.tmp"))
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=30) in (130, 0)
-    assert process.returncode == 0 or not out.exists()
-    assert not list(tmp_path.glob(".*.tmp"))
+    assert process.wait(timeout=30) == 130
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["run.mcap", "waiting"]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,11 +15,16 @@ from hypothesis import strategies as st
 
 from tests.json_log import Said, image, joints, number, transform, write_json_log
 from tests.real_data import real_data
-from tests.synthetic import write_mcap, write_zarr
+from tests.synthetic import START_NS, write_mcap, write_zarr
+from tests.video_logs import PERIOD_NS, VIDEO, Row, write_depth, write_log
+from tests.video_logs import joints as video_joints
+from tests.video_packets import encode, number_of, numbered_frames, video_message
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import LogError
 from vilp_data.ingest import ingest_logs
+from vilp_data.log_summary import format_summary, summarise
 from vilp_data.model_size import common_size, cut_share, model_size
+from vilp_data.sources.mcap_log import McapLog
 from vilp_data.spec import TaskSpec, parse_task
 from vilp_data.suggest_spec import suggest_spec
 
@@ -155,6 +163,31 @@ def test_transforms_are_offered_from_the_root_to_the_tool(tmp_path: Path) -> Non
     assert episode.low_dim.shape[1] == 2 + 7
 
 
+def test_frames_may_be_called_like_arrows(tmp_path: Path) -> None:
+    tree = [transform(k / 10, "a -> b", "tool -> 0\n", 1.0) for k in range(20)]
+    text = suggest_spec(write_json_log(tmp_path / "run.mcap", [*frames(), *states(), *tree]))
+    assert 'from_frame = "a -> b", to_frame = "tool -> 0\\n"' in text
+    episode = ingested(tmp_path / "run.mcap", uncommented(text, "low_dim.tool_-_0"), tmp_path / "data").read("run")
+    assert episode.low_dim.shape[1] == 2 + 7
+
+
+@pytest.mark.parametrize(("offset_s", "said"), [(30.0, "30.0 s before"), (-30.0, "30.0 s after")])
+def test_stamps_that_lie_far_off_are_said_to_lie_before_or_after(tmp_path: Path, offset_s: float, said: str) -> None:
+    early = [joints(k / 10 - offset_s, ["a"], [1.0])._replace(t_s=k / 10) for k in range(20)]
+    log = write_json_log(tmp_path / "run.mcap", [*early, *(number(k / 10, 1.0, "/cmd") for k in range(20))])
+    assert f"header stamps lie {said} log time" in suggest_spec(log)
+    assert f"header stamps lie {said} log time" in format_summary(summarise(log))
+
+
+def test_a_pause_is_not_made_of_what_the_index_does_not_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = [*frames(), *(message._replace(t_s=message.t_s + 60) for message in frames())]
+    log = write_json_log(tmp_path / "run.mcap", said)
+    assert "the log pauses" in suggest_spec(log)
+    whole = McapLog.message_times
+    monkeypatch.setattr(McapLog, "message_times", lambda log: ({t: n[:-5] for t, n in whole(log)[0].items()}, True))
+    assert "the log pauses" not in suggest_spec(log)
+
+
 def test_headers_that_tell_no_time_are_not_used(tmp_path: Path) -> None:
     still = [
         Said(k / 10, "/joint_states", "sensor_msgs/msg/JointState", joints(0.0, ["a"], [k / 10]).body)
@@ -220,6 +253,58 @@ def test_a_raw_topic_beside_its_compressed_one_is_not_a_second_camera(tmp_path: 
     text = suggest_spec(write_json_log(tmp_path / "run.mcap", said))
     assert [view.topic for view in parse_task(text, where="x").views.values()] == ["/cam/left/image_raw/compressed"]
     assert "/cam/left/image_raw: shows what /cam/left/image_raw/compressed shows" in text
+
+
+def thermal(number: int) -> Any:
+    return np.random.default_rng(number).integers(7000, 9000, (48, 64)).astype(np.uint16)
+
+
+def test_grey_of_16_bits_is_suggested_as_a_picture_and_as_depth_only_to_un_comment(tmp_path: Path) -> None:
+    log = write_depth(tmp_path / "run.mcap", [thermal(n) for n in range(12)], "mono16", topic="/thermal/image_raw")
+    text = suggest_spec(log)
+    (view,) = parse_task(text, where="suggested").views.values()
+    assert view.depth is None
+    assert view.levels is not None
+    assert 7000 <= view.levels[0] < 7100 < 8900 < view.levels[1] <= 9000
+    assert ingested(log, text, tmp_path / "picture")
+    other = uncommented(re.sub(r"^levels = .*$", "", text, flags=re.M), "depth")
+    (view,) = ingested(log, other, tmp_path / "depth").spec().views.values()
+    assert view.depth is not None
+
+
+def test_grey_of_16_bits_on_a_topic_called_depth_is_suggested_as_depth(tmp_path: Path) -> None:
+    log = write_depth(tmp_path / "run.mcap", [thermal(n) for n in range(12)], "mono16", topic="/camera/depth/image_raw")
+    text = suggest_spec(log)
+    (view,) = parse_task(text, where="suggested").views.values()
+    assert view.depth is not None
+    assert "\n# levels = [" in text
+
+
+def test_a_png_of_16_bits_is_a_camera(tmp_path: Path) -> None:
+    data = [base64.b64encode(cv2.imencode(".png", thermal(n))[1].tobytes()).decode() for n in range(12)]
+    said = [Said(n / 10, "/ir", "foxglove.CompressedImage", {"format": "png", "data": d}) for n, d in enumerate(data)]
+    log = write_json_log(tmp_path / "run.mcap", said)
+    assert ingested(log, suggest_spec(log), tmp_path / "data").spec().views["ir"].levels is not None
+    assert "48x64" in format_summary(summarise(log))
+
+
+def test_video_with_b_frames_is_never_read_by_log_time(tmp_path: Path) -> None:
+    sent = encode(numbered_frames(40), "h264 with B frames")
+    rows = [
+        Row(START_NS + n * PERIOD_NS, VIDEO, video_message(p.data, "h264").body, START_NS + (p.shows - 70) * PERIOD_NS)
+        for n, p in enumerate(sent)
+    ]
+    log = write_log(tmp_path / "run.mcap", [*rows, *video_joints(40)])
+    text = suggest_spec(log)
+    (view,) = parse_task(text, where="suggested").views.values()
+    assert view.clock == "header"
+    assert view.offset_s == pytest.approx(7.0, abs=0.3)
+    store = ingested(log, text, tmp_path / "data")
+    (entry,) = store.index()
+    frames = store.read_frames(next(iter(store.spec().views)), entry)
+    numbers = [number_of(frame) for frame in frames]
+    assert numbers == sorted(numbers)
+    assert len(numbers) > 30
 
 
 def test_odd_names_still_make_a_task(tmp_path: Path) -> None:

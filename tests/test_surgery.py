@@ -21,15 +21,15 @@ from vilp_data.dataset_split import check_dataset_split, find_split, update_spli
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, UsageError
+from vilp_data.idle import moving_range
 from vilp_data.ingest import IngestReport, ingest_logs
 from vilp_data.latents import latents_path, open_latents, read_latents
 from vilp_data.pairs import PairDataset
+from vilp_data.removed import read_removed
 from vilp_data.spec import TaskSpec, WindowSpec
-from vilp_data.surgery.idle import moving_range
-from vilp_data.surgery.operations import parse_steps, plan_trim, relabel_episodes, remove_episodes, trim_episodes
-from vilp_data.surgery.removed import read_removed
-from vilp_data.surgery.undo import undo
+from vilp_data.surgery.operations import parse_steps, plan_trim, remove_episodes, trim_episodes
 from vilp_data.types import Episode
+from vilp_data.writer_lock import writer_lock
 
 
 def moving(name: str, *, idle: int, moves: int, after: int) -> Episode:
@@ -90,7 +90,7 @@ def test_removing_twice_does_nothing_and_an_unknown_id_names_the_nearest(root: P
 
 
 def test_a_dataset_that_another_process_writes_is_not_operated_on(root: Path) -> None:
-    with shards.writer_lock(root), pytest.raises(BusyError):
+    with writer_lock(root), pytest.raises(BusyError):
         remove_episodes(root, ["a"])
 
 
@@ -237,6 +237,15 @@ def test_a_trim_that_leaves_too_little_is_refused_and_changes_nothing(
     assert tree(root) == before
 
 
+def test_a_trim_that_would_be_refused_is_refused_when_planned(root: Path) -> None:
+    for steps in ((100, 200), (4, 5)):
+        with pytest.raises(UsageError, match=r"no such range|no motion"):
+            plan_trim(root, ["a"], steps=steps)
+    trim_episodes(root, plan_trim(root, ["a"], steps=(8, 15)))
+    with pytest.raises(UsageError, match="no such range"):
+        plan_trim(root, ["a"], steps=(0, 5))
+
+
 def test_ranges_of_steps_are_slices() -> None:
     assert [parse_steps(text) for text in ("10:140", "10:", ":-5")] == [(10, 140), (10, None), (None, -5)]
     for wrong in ("10", "a:b", "1:2:3", ""):
@@ -286,69 +295,6 @@ def test_the_split_knows_a_trimmed_episode_as_what_it_was(root: Path) -> None:
     assert before is not None
     assert after is not None
     assert (after.assignment, after.contents) == (before.assignment, before.contents)
-
-
-# --- relabel ---------------------------------------------------------------------------------------------------------------
-
-
-def test_labels_are_set_taken_away_and_said(root: Path) -> None:
-    frames = {name: data for name, data in tree(root).items() if "/frames/" in name}
-    relabel_episodes(root, ["a", "b"], labels={"operator": "anna", "success": "false"})
-    entry = EpisodeStore(root).entry("a")
-    assert (entry.tags, entry.outcome) == ({"operator": "anna", "success": "false"}, "failure")
-    assert entry.key == "key of a"
-    relabel_episodes(root, ["a"], unset=["success", "operator"])
-    entry = EpisodeStore(root).entry("a")
-    assert (entry.tags, entry.outcome, entry.edits) == ({}, "success", {})  # as ingest left it
-    assert {name: data for name, data in tree(root).items() if "/frames/" in name} == frames
-    assert relabel_episodes(root, ["b"], labels={"operator": "anna"}).operation is None
-
-
-def test_labels_that_say_nothing_or_two_things_are_refused(root: Path) -> None:
-    for labels, unset, message in (
-        ({}, [], "no label"),
-        ({"a": "1"}, ["a"], "set and taken away"),
-        ({"source": "rollout"}, [], "not a label"),
-    ):
-        with pytest.raises(UsageError, match=message):
-            relabel_episodes(root, ["a"], labels=labels, unset=unset)
-
-
-def test_labels_and_trims_survive_another_ingest_of_the_same_log(tmp_path: Path) -> None:
-    log, root = write_mcap(tmp_path / "run.mcap", tags={"operator": "ben", "success": "false"}), tmp_path / "data"
-    other = write_mcap(tmp_path / "other.mcap", jitter_s=0.001, seed=3)
-    spec, logs = task_spec(log), [log.path, other.path]
-    ingest(logs, root, spec, include_failures=True)
-    relabel_episodes(root, ["run"], labels={"operator": "anna", "success": "true"})
-    trim_episodes(root, plan_trim(root, ["run"], steps=(4, 16)))
-    steps = EpisodeStore(root).steps_path("run").read_bytes()
-    assert sorted(ingest(logs, root, spec).fresh) == ["other", "run"]
-    EpisodeStore(root).frames_path("front", "run").unlink()  # damaged: it is ingested anew
-    assert ingest(logs, root, spec).written == ["run"]
-    assert EpisodeStore(root).steps_path("run").read_bytes() == steps
-    table = spec.model_dump(by_alias=True)
-    table["views"]["front"] |= {"height": 24, "width": 32}
-    table["rate_hz"] = 5.0
-    assert ingest(logs, root, TaskSpec.model_validate(table)).written == ["other", "run"]
-    entry = EpisodeStore(root).entry("run")
-    assert (entry.tags["operator"], entry.outcome) == ("anna", "success")
-    assert entry.n_steps == 6  # the same stretch of time at half the rate
-    np.testing.assert_allclose(EpisodeStore(root).read("run").low_dim[0, 0], 0.4, atol=1e-5)
-
-
-def test_labels_of_a_demonstration_that_changed_are_said_to_be_lost(tmp_path: Path) -> None:
-    import zarr
-
-    log, root = write_zarr(tmp_path / "replay.zarr"), tmp_path / "data"
-    ingest([log.path], root, zarr_task_spec())
-    relabel_episodes(root, ["replay-episode_001"], labels={"operator": "anna"})
-    before = tree(root)
-    zarr.open_group(log.path)["data/action"][15] = 77.0
-    report = ingest([log.path], root, zarr_task_spec())
-    assert report.replaced == ["replay-episode_001"]
-    assert "its labels no longer hold" in report.notes[0]
-    undo(root)
-    assert tree(root) == before
 
 
 # --- models that were trained before ------------------------------------------------------------------------------------------

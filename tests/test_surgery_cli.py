@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from tests.stored_episodes import add_episodes, episode, write_dataset
 from tests.surgery_operations import other_dataset
 from vilp_data.cli import main
+from vilp_data.dataset_state import DatasetState, EpisodeState
+from vilp_data.edits import edited, edits_of, relabelled, trimmed
 from vilp_data.episode_entry import EpisodeEntry
 from vilp_data.episodes import EpisodeStore
-from vilp_data.surgery.dataset_state import DatasetState, EpisodeState
-from vilp_data.surgery.edits import edited, edits_of, relabelled, trimmed
 from vilp_data.surgery.state_diff import compare_states
 
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "surgery.md"
@@ -108,6 +108,9 @@ def test_reports_as_json_are_json(shell: Shell) -> None:
         ("diff 7 --data data/tuesday", "no operation 7"),
         ("diff nowhere --data data/tuesday", "neither a dataset nor an operation"),
         ("gc data/tuesday --keep -1", "is not negative"),
+        ("gc data/tuesday --run runs/vqgna", "not the run of a frame encoder"),
+        ("trim a --steps 100:200 --dry-run --data data/tuesday", "no such range"),
+        ("relabel a --set success=maybe --data data/tuesday", "true or false"),
     ],
 )
 def test_wrong_use_ends_with_2_and_says_what_to_do(shell: Shell, command: str, words: str) -> None:
@@ -115,6 +118,38 @@ def test_wrong_use_ends_with_2_and_says_what_to_do(shell: Shell, command: str, w
     assert words in said
     assert "->" in said
     assert "Traceback" not in said
+
+
+def test_a_damaged_entry_of_the_log_is_named_and_the_others_are_shown(shell: Shell) -> None:
+    shell("relabel a --set operator=anna --data data/tuesday")
+    Path("data/tuesday/history/0001.json").write_text("{")
+    said = shell("log data/tuesday", ends=1)
+    assert "relabel: 1 episode (a)" in said
+    assert "0001.json: not an entry" in said
+    assert "operation 2 (relabel) taken back" in shell("undo data/tuesday")
+
+
+def test_what_an_undo_took_comes_back_by_the_command_it_names(shell: Shell) -> None:
+    shell("relabel a --set operator=anna --data data/tuesday")
+    said = shell("undo data/tuesday")
+    command = said.partition("`vilp-data ")[2].partition("`")[0]
+    assert "operation 2 (relabel) brought again" in shell(command)
+    assert EpisodeStore(Path("data/tuesday")).entry("a").tags == {"operator": "anna"}
+
+
+def test_a_dataset_that_is_called_as_an_operation_is_asked_about(shell: Shell) -> None:
+    shell("relabel a --set operator=anna --data data/tuesday")
+    Path("data/monday").rename("2")
+    said = shell("diff 2 --data data/tuesday", ends=2)
+    assert "./2 for the dataset, 02 for the operation" in said
+    assert "4 episodes" in shell("diff 02 --data data/tuesday")
+    assert "3 episodes" in shell("diff ./2 --data data/tuesday", ends=1)
+
+
+def test_a_damaged_split_is_drawn_anew_as_its_error_says(shell: Shell) -> None:
+    Path("data/tuesday/split.lock.json").write_text("{")
+    assert "--redraw" in shell("split data/tuesday", ends=1)
+    assert "training" in shell("split data/tuesday --redraw")
 
 
 def test_a_trim_that_is_only_looked_at_changes_nothing(shell: Shell) -> None:
@@ -170,7 +205,7 @@ def test_any_trims_one_after_the_other_are_one_trim(n_steps: int, data: st.DataO
     assert seen[cut["source_index/top"]].tolist() == steps["source_index/top"][begin:end].tolist()
     assert set(seen) == set(steps["source_index/top"][begin:end])  # and no frame besides
     assert kept.stored_frames("top") == len(frames)
-    again, same = edited(entry, steps, edits_of(kept))  # as after another ingest
+    again, same = edited(entry, steps, edits_of(kept.edits))  # as after another ingest
     assert again == kept
     assert same["log_time_ns"].tolist() == cut["log_time_ns"].tolist()
 
@@ -190,7 +225,7 @@ def test_labels_say_what_was_said_last_and_go_without_a_trace(calls: list[tuple[
         now = relabelled(now, labels=labels, unset=tuple(sorted(unset)))
         expected = {tag: value for tag, value in {**expected, **labels}.items() if tag not in unset}
     assert now.tags == expected
-    assert edited(entry, steps, edits_of(now))[0] == now
+    assert edited(entry, steps, edits_of(now.edits))[0] == now
     added = tuple(sorted(now.tags.keys() - entry.tags.keys()))
     assert relabelled(now, labels=dict(entry.tags), unset=added) == entry
 

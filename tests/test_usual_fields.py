@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from rosbags.typesys import Stores, get_typestore
 
 from vilp_data.decode.usual_fields import usual_fields
-from vilp_data.decode.vectors import concerns, decode_vector
+from vilp_data.decode.vectors import concerns, decode_vector, rotation_columns
 from vilp_data.errors import DecodeError
 from vilp_data.types import Message
 
@@ -53,7 +53,7 @@ def message(schema: str, body: Any) -> Message:
         ("geometry_msgs/msg/Twist", 6), ("geometry_msgs/msg/TwistStamped", 6), ("geometry_msgs/msg/TwistWithCovarianceStamped", 6),
         ("geometry_msgs/msg/Wrench", 6), ("geometry_msgs/msg/WrenchStamped", 6), ("geometry_msgs/msg/AccelStamped", 6),
         ("geometry_msgs/msg/PointStamped", 3), ("geometry_msgs/msg/Vector3Stamped", 3), ("geometry_msgs/msg/QuaternionStamped", 4),
-        ("sensor_msgs/msg/Imu", 6), ("sensor_msgs/msg/Joy", 6), ("trajectory_msgs/msg/JointTrajectory", 3),
+        ("sensor_msgs/msg/Imu", 6), ("sensor_msgs/msg/Joy", 6), ("trajectory_msgs/msg/JointTrajectoryPoint", 3),
         ("std_msgs/msg/Float32MultiArray", 3), ("std_msgs/msg/Float64", 1), ("std_msgs/msg/Int16MultiArray", 3), ("std_msgs/msg/Bool", 1),
         ("std_msgs/msg/UInt8MultiArray", 3),
     ],
@@ -114,6 +114,49 @@ def test_msg_is_a_field_where_a_message_has_one() -> None:
 
 def test_a_bare_array_may_be_called_msg() -> None:
     assert decode_vector(message("array", np.arange(4.0)), ["msg[1:3]"]).tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(("path", "expected"), [("rows[-1]", [6, 7]), ("rows[-2][-1]", [5]), ("position[-3]", [1])])
+def test_lists_are_counted_from_their_end_too(path: str, expected: list[float]) -> None:
+    assert decode_vector(message("own/Type", BODY), [path]).tolist() == expected
+
+
+@pytest.mark.parametrize("path", ["rows[-3]", "rows[2]", "position[1:1]", "position[-2:3]", "position[0:4]"])
+def test_a_path_that_reaches_outside_its_list_is_refused(path: str) -> None:
+    with pytest.raises(DecodeError, match="reaches outside its list"):
+        decode_vector(message("own/Type", BODY), [path])
+
+
+def test_of_a_trajectory_with_several_points_the_task_names_the_command() -> None:
+    points = [SimpleNamespace(positions=np.array([float(k), 9.0])) for k in range(3)]
+    body = SimpleNamespace(joint_names=["a", "b"], points=points)
+    trajectory = message("trajectory_msgs/msg/JointTrajectory", body)
+    with pytest.raises(DecodeError, match=r"which point of a trajectory(.|\n)*points\[-1\]\.positions"):
+        decode_vector(trajectory)
+    assert decode_vector(trajectory, ["points[-1].positions"]).tolist() == [2, 9]
+    assert decode_vector(trajectory, ["points[0].positions"], ["b", "a"]).tolist() == [9, 0]
+
+
+@pytest.mark.parametrize("nothing", [None, "x", {}, 10**400])
+def test_a_number_that_is_none_is_refused_with_its_path(nothing: Any) -> None:
+    pose = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": nothing, "w": 1}}
+    with pytest.raises(DecodeError, match="'pose'"):
+        decode_vector(message("geometry_msgs/msg/PoseStamped", {"pose": pose}))
+
+
+@pytest.mark.parametrize(
+    ("fields", "columns"),
+    [
+        (["pose"], [3]), (["pose.orientation"], [0]), (["speed", "poses"], [4, 11]), (["pose.position"], []), (["quad"], []),
+        (["pose.orientation.x", "pose.orientation.y", "pose.orientation.z", "pose.orientation.w"], [0]),
+        (["pose.orientation.w", "pose.orientation.x", "pose.orientation.y", "pose.orientation.z"], []),
+        ([f"quad[{k}]" for k in range(4)], []),
+    ],
+)  # fmt: skip
+def test_rotations_are_found_where_a_vector_holds_them(fields: list[str], columns: list[int]) -> None:
+    pose = {"position": dict.fromkeys("xyz", 1.0), "orientation": dict.fromkeys("xyzw", 0.5)}
+    body = {"pose": pose, "poses": [pose, pose], "speed": 3.0, "quad": [0.5] * 4}
+    assert list(rotation_columns(message("own/Type", body), fields)) == columns
 
 
 def test_a_list_of_points_is_all_their_numbers() -> None:

@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.json_log import Said, image, joints, number, transform, write_json_log
+from tests.json_log import Said, image, joints, number, stamp, transform, write_json_log
 from tests.real_data import real_data
+from vilp_data import transform_tree
 from vilp_data.assemble import assemble_episode
 from vilp_data.errors import DecodeError, LogError, SpecError
 from vilp_data.ingest import ingest_logs
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec, parse_task
 from vilp_data.types import Episode
+from vilp_data.vector_tracks import age_names
 
 VIEWS = {"front": {"topic": "/camera/front/image", "height": 48, "width": 64}}
 TOOL = {"topic": "/tf", "from_frame": "base", "to_frame": "tool"}
@@ -41,6 +43,37 @@ def test_low_dim_may_be_the_transform_between_two_frames(tmp_path: Path) -> None
     np.testing.assert_allclose(episode.low_dim[:, 0], 100 + np.arange(20) / 10, atol=1e-5)
     np.testing.assert_array_equal(episode.low_dim[:, 1:], np.tile([0, 0, 0, 0, 0, 1], (20, 1)))
     np.testing.assert_allclose(episode.age_s["/tf base->tool"], 0, atol=1e-6)
+
+
+def test_the_age_of_a_transform_is_that_of_its_oldest_link(tmp_path: Path) -> None:
+    said = [message for message in robot() if message.topic != "/tf" or "tool" in str(message.body)]
+    said += [transform(0.4 * k, "base", "arm", 1.0) for k in range(5)]
+    episode = assemble(write_json_log(tmp_path / "run.mcap", said), low_dim={"tool": TOOL})
+    np.testing.assert_allclose(episode.age_s["/tf base->tool"][:9], [0, 0.1, 0.2, 0.3] * 2 + [0], atol=1e-6)
+
+
+def test_a_long_log_s_transforms_are_read_again_where_a_late_joint_needs_what_was_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The hand's own links come all along; that the tool hangs on it is said at the end, when they have been passed over."""
+    said = [image(k / 10, index=k) for k in range(20)]
+    said += [transform(k / 50, "base", "hand", k / 50) for k in range(100)]
+    said += [transform(k / 50, "base" if k < 75 else "hand", "tool", 100.0) for k in range(100)]
+    log = write_json_log(tmp_path / "run.mcap", said)
+    whole = assemble(log, low_dim={"tool": TOOL})
+    monkeypatch.setattr(transform_tree, "LINKS_BEFORE_SORTING_OUT", 20)
+    again = assemble(log, low_dim={"tool": TOOL})
+    np.testing.assert_array_equal(again.low_dim, whole.low_dim)
+    np.testing.assert_allclose(again.low_dim[:, 0], [100 + (k / 10 if k >= 15 else 0) for k in range(20)], atol=1e-5)
+
+
+@pytest.mark.parametrize("body", [{"transforms": 3}, {"transforms": [{"header": {}}]}])
+def test_a_damaged_transform_keeps_no_other_log_back(tmp_path: Path, body: dict[str, Any]) -> None:
+    good = write_json_log(tmp_path / "good.mcap", robot())
+    bad = write_json_log(tmp_path / "bad.mcap", [*robot(), Said(0.5, "/tf", "tf2_msgs/msg/TFMessage", body)])
+    spec = TaskSpec.model_validate({"name": "x", "rate_hz": 10.0, "views": VIEWS, "low_dim": {"tool": TOOL}})
+    report = ingest_logs([bad, good], tmp_path / "data", spec, workers=1)
+    assert (report.written, [name for name, _ in report.failed]) == (["good"], ["bad"])
 
 
 def test_parts_may_be_of_several_frames_and_take_some_columns(tmp_path: Path) -> None:
@@ -129,12 +162,82 @@ def test_joints_of_several_publishers_on_one_topic_are_told_apart_by_name(tmp_pa
     episode = assemble(log, low_dim=low_dim)
     np.testing.assert_allclose(episode.low_dim[1:, 1], np.arange(1, 20) / 10, atol=1e-6)
     np.testing.assert_allclose(episode.low_dim[1:, 2], np.arange(19) / 10, atol=1e-6)
+    assert episode.age_s["/joint_states low_dim.arm"].max() < 0.001
+    np.testing.assert_allclose(episode.age_s["/joint_states low_dim.hand"][1:], 0.09, atol=1e-6)
     with pytest.raises(LogError, match=r"is of the joints named\n.*did you mean 'elbow'"):
         assemble(log, low_dim={"arm": {"topic": "/joint_states", "names": ["elbo"]}})
     with pytest.raises(DecodeError, match="no joint 'shoulder'"):
         assemble(log, low_dim={"arm": {"topic": "/joint_states", "names": ["elbow", "shoulder"]}})
     with pytest.raises(DecodeError, match="different lengths"):
         assemble(log, low_dim={"all": {"topic": "/joint_states"}})
+
+
+def test_ages_have_names_of_their_own_only_where_they_may_differ() -> None:
+    def names(**table: Any) -> set[str]:
+        return set(age_names(TaskSpec.model_validate({"name": "x", "views": VIEWS, **table})).values())
+
+    def parts(**changes: Any) -> dict[str, Any]:
+        return {"a": {"topic": "/x"}, "b": {"topic": "/x", **changes}}
+
+    assert names(low_dim=parts(fields=["velocity"])) == {"/x"}
+    assert names(low_dim=parts(names=["elbow"])) == {"/x low_dim.a", "/x low_dim.b"}
+    assert names(low_dim={"a": {"topic": "/x"}}, action={"b": {"topic": "/x"}}) == {"/x low_dim.a", "/x action.b"}
+    rotation = {"topic": "/x", "kind": "delta_rotation", "frame": "base"}
+    assert names(action={"a": {"topic": "/x", "kind": "delta"}, "b": rotation}) == {"/x"}
+    assert names(action=parts(kind="delta")) == {"/x action.a", "/x action.b"}
+    frames = {"from_frame": "base", "to_frame": "tool"}
+    assert names(low_dim={"a": {"topic": "/x"} | frames, "b": {"topic": "/x"} | frames}) == {"/x base->tool"}
+
+
+# --- rotations of poses -------------------------------------------------------------------------------------------------------
+
+
+def poses(quaternion: Any, *, topic: str = "/pose", count: int = 20) -> list[Said]:
+    """Poses at 10 Hz whose quaternion x y z w at step k is `quaternion(k)`."""
+
+    def body(k: int) -> dict[str, Any]:
+        orientation = dict(zip("xyzw", quaternion(k), strict=True))
+        return {
+            "header": {"stamp": stamp(k / 10)},
+            "pose": {"position": {"x": 1, "y": 2, "z": 3}, "orientation": orientation},
+        }
+
+    return [Said(k / 10, topic, "geometry_msgs/msg/PoseStamped", body(k)) for k in range(count)]
+
+
+FOUR = ["pose.orientation.x", "pose.orientation.y", "pose.orientation.z", "pose.orientation.w"]
+
+
+@pytest.mark.parametrize("fields", [[], ["pose"], ["pose.orientation"], ["pose.position.x", *FOUR]])
+def test_a_quaternion_that_was_never_set_masks_its_steps(tmp_path: Path, fields: list[str]) -> None:
+    said = [image(k / 10, index=k) for k in range(20)] + poses(lambda k: (0, 0, 0, 0 if k < 8 else 1))
+    episode = assemble(
+        write_json_log(tmp_path / "run.mcap", said), low_dim={"pose": {"topic": "/pose", "fields": fields}}
+    )
+    assert episode.valid.tolist() == [False] * 8 + [True] * 12
+    assert not episode.low_dim[:8, -4:].any()
+
+
+@pytest.mark.parametrize("fields", [[], ["pose.orientation"], FOUR])
+@pytest.mark.parametrize("part", ["low_dim", "action"])
+def test_a_quaternion_that_flips_its_sign_is_stored_continuous_from_its_first(
+    tmp_path: Path, fields: list[str], part: str
+) -> None:
+    turn = [(0.0, 0.0, np.sin(k / 40), -np.cos(k / 40)) for k in range(20)]
+    flipped = poses(lambda k: [number * (-1) ** (k // 3) for number in turn[k]])
+    log = write_json_log(tmp_path / "run.mcap", [*(image(k / 10, index=k) for k in range(20)), *flipped])
+    episode = assemble(log, **{part: {"pose": {"topic": "/pose", "fields": fields}}})
+    found = episode.low_dim if part == "low_dim" else episode.action
+    assert found is not None
+    np.testing.assert_allclose(found[:, -4:], turn, atol=1e-6)
+
+
+def test_four_numbers_that_are_no_quaternion_stay_as_they_are(tmp_path: Path) -> None:
+    said = [image(k / 10, index=k) for k in range(20)]
+    said += [joints(k / 10, list("xyzw"), [0.0, 0.0, 0.0, (-1.0) ** k * (k > 3)]) for k in range(20)]
+    episode = assemble(write_json_log(tmp_path / "run.mcap", said), low_dim={"joints": {"topic": "/joint_states"}})
+    assert episode.valid.all()
+    assert episode.low_dim[:6, 3].tolist() == [0, 0, 0, 0, 1, -1]
 
 
 # --- without cameras ------------------------------------------------------------------------------------------------------------

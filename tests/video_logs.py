@@ -69,7 +69,9 @@ def write_video(path: Path, sent: Sequence[Encoded], name: str, **options: Any) 
     return write_log(path, [*rows, *joints(len(sent))], **options)
 
 
-def write_depth(path: Path, images: Sequence[npt.NDArray[Any]], encoding: str, **options: Any) -> Path:
+def write_depth(
+    path: Path, images: Sequence[npt.NDArray[Any]], encoding: str, *, topic: str = DEPTH, **options: Any
+) -> Path:
     """A log of raw depth images [H,W] at RATE_HZ."""
     rows = []
     for number, image in enumerate(images):
@@ -77,7 +79,7 @@ def write_depth(path: Path, images: Sequence[npt.NDArray[Any]], encoding: str, *
         data = np.ascontiguousarray(image).astype(image.dtype.newbyteorder("<")).tobytes()
         step = width * image.dtype.itemsize
         body = RawImage(height=height, width=width, encoding=encoding, step=step, data=data, frame_id="depth")
-        rows.append(Row(START_NS + number * PERIOD_NS, DEPTH, body))
+        rows.append(Row(START_NS + number * PERIOD_NS, topic, body))
     return write_log(path, [*rows, *joints(len(images))], **options)
 
 

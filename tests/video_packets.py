@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -88,6 +88,16 @@ def encode(
             picture.pts, picture.time_base = number, Fraction(1, 30)
         packets += [Encoded(int(p.pts), bytes(p), bool(p.is_keyframe)) for p in context.encode(picture)]
     return packets
+
+
+def parted(data: bytes, units: Iterable[bytes]) -> tuple[bytes, bytes]:
+    """These units of a packet of H.264 or H.265, and the packet without them."""
+    rest = data
+    for unit in units:
+        assert unit in rest
+        rest = rest.replace(unit, b"", 1)
+    start = rest.find(b"\0\0\1")
+    return b"".join(units), b"\0" + rest[start:]
 
 
 def video_message(data: bytes, name: str, *, number: int = 0, topic: str = "/video") -> Message:

@@ -6,12 +6,13 @@ step k is the command in force over [t_k, t_{k+1}). Replaying an ingested episod
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from vilp_data import rotations
 from vilp_data.errors import AlignError
 from vilp_data.types import F32, F64, I64, Bool
 
@@ -24,6 +25,12 @@ BACKWARD_JUMP_NS = 1_000_000_000
 LONGEST_GAP_NS = 60_000_000_000
 """A minute without an image, where images come a hundred times as often, is no pause within a demonstration."""
 
+ALWAYS_NS = -(1 << 62)
+"""The stamp of what holds from the beginning of time."""
+
+NEVER_NS = -(1 << 63)
+"""The stamp of what has not come."""
+
 Index = npt.NDArray[np.int64]
 
 
@@ -34,6 +41,33 @@ class Observed:
     index: Index
     age_s: F32
     valid: Bool
+
+
+@dataclass(frozen=True)
+class Latest:
+    """What holds at each of F instants: values float64 [F,D], NaN where nothing has come; and since when, int64 [F], ALWAYS_NS for
+    what always held, NEVER_NS where nothing has come."""
+
+    values: F64
+    stamps_ns: I64
+
+    def age_s(self, ticks_ns: I64) -> F64:
+        """How old each is at its tick, float64 [F]: 0 for what is newer or always held, NaN where nothing has come."""
+        age = np.full(len(ticks_ns), np.nan)
+        stamped = self.stamps_ns > ALWAYS_NS
+        age[stamped] = np.maximum(ticks_ns[stamped] - self.stamps_ns[stamped], 0) / 1e9
+        age[self.stamps_ns == ALWAYS_NS] = 0
+        return age
+
+
+def in_time(stamps: Sequence[int] | I64, *, topic: str, may_repeat: int = 1) -> tuple[I64, Index]:
+    """Stamps int64 [M] as they came, and the order that sorts them. AlignError where more than `may_repeat` of them are one and the
+    same, so that they tell no time, or where the clock was reset."""
+    stamps_ns = np.array(stamps, np.int64)
+    if len(stamps) > may_repeat and stamps_ns.min() == stamps_ns.max():
+        found = f"{len(stamps)} messages, all stamped {stamps[0]} ns"
+        raise AlignError("its stamps tell no time", where=topic, found=found, remedy='set clock = "log" for this topic')
+    return stamps_ns, order_of(stamps_ns, topic=topic)
 
 
 def order_of(stamps_ns: I64, *, topic: str) -> Index:
@@ -59,25 +93,27 @@ def median_rate_hz(stamps_ns: I64) -> float:
     return float(1e9 / np.median(intervals))
 
 
-def control_ticks(view_stamps_ns: Mapping[str, I64], rate_hz: float) -> I64:
-    """Ticks at `rate_hz` from the first instant at which every view has an image to the last image of the view that ends first.
+def control_ticks(stamps_ns: Mapping[str, I64], rate_hz: float) -> I64:
+    """Ticks at `rate_hz` from the first instant at which each of these has come (a task's views; without any, its low_dim parts) to the
+    last message of the one that ends first.
 
-    Raises AlignError where views do not overlap, or one is silent for so long that its clock must have been set ahead."""
-    for view, stamps in view_stamps_ns.items():
+    Raises AlignError where they do not overlap, or one is silent for so long that its clock must have been set ahead."""
+    for name, stamps in stamps_ns.items():
         gaps = np.diff(stamps)
         if len(gaps) and gaps.max() > max(LONGEST_GAP_NS, 100 * float(np.median(gaps))):
             raise AlignError(
-                "the clock jumps ahead, or the camera was off",
-                where=f"view {view}",
-                found=f"{gaps.max() / 1e9:.1f} s without an image, after image {int(gaps.argmax())}",
-                remedy='read this topic by its arrival (clock = "log"), or cut the log there',
+                "the clock jumps ahead, or nothing came for long",
+                where=name,
+                found=f"{gaps.max() / 1e9:.1f} s of silence, after message {int(gaps.argmax())}",
+                remedy='read this topic by its arrival (clock = "log"), or cut the log there ([episodes] by = "gap")',
             )
-    start = max(int(stamps[0]) for stamps in view_stamps_ns.values())
-    end = min(int(stamps[-1]) for stamps in view_stamps_ns.values())
+    first = max(stamps_ns, key=lambda name: int(stamps_ns[name][0]))
+    last = min(stamps_ns, key=lambda name: int(stamps_ns[name][-1]))
+    start, end = int(stamps_ns[first][0]), int(stamps_ns[last][-1])
     if end < start:
         raise AlignError(
-            "the views do not overlap in time",
-            found=f"one ends {(start - end) / 1e9:.3f} s before another begins",
+            f"{last} and {first} do not overlap in time",
+            found=f"{last} ends {(start - end) / 1e9:.3f} s before {first} begins",
             remedy="check the clocks with `vilp-data inspect`",
         )
     count = int((end + TOLERANCE_NS - start) * rate_hz / 1e9) + 1
@@ -93,9 +129,10 @@ def observe(stamps_ns: I64, ticks_ns: I64, *, stale_after_s: float) -> Observed:
     return Observed(index, age.astype(np.float32), seen & (np.nan_to_num(age, nan=np.inf) <= stale_after_s))
 
 
-def command_in_force(stamps_ns: I64, ticks_ns: I64, *, period_ns: int) -> Index:
-    """For absolute targets: the last command issued before t_{k+1}, be it in [t_k, t_{k+1}) or held from before; -1 for none."""
-    return np.searchsorted(stamps_ns, _interval_ends(ticks_ns, period_ns), side="left") - 1
+def last_instants(ticks_ns: I64, *, period_ns: int) -> I64:
+    """The last instant of each [t_k, t_{k+1}), int64 [F]: of absolute targets the latest one by then is in force, be it issued in the
+    interval or held from before."""
+    return _interval_ends(ticks_ns, period_ns) - 1
 
 
 def sum_deltas(stamps_ns: I64, values: F64, ticks_ns: I64, *, period_ns: int) -> F64:
@@ -117,11 +154,11 @@ def compose_rotations(stamps_ns: I64, values: F64, ticks_ns: I64, *, period_ns: 
         if last[k] - first[k] == 1:
             out[k] = values[first[k]]
             continue
-        total = np.array([1.0, 0.0, 0.0, 0.0])
+        total = np.array([0.0, 0.0, 0.0, 1.0])
         for rotation in values[first[k] : last[k]]:
-            q = _quaternion(rotation)
-            total = _product(total, q) if tool_frame else _product(q, total)
-        out[k] = _axis_angle(total)
+            q = rotations.from_axis_angle(rotation)
+            total = rotations.product(total, q) if tool_frame else rotations.product(q, total)
+        out[k] = rotations.to_axis_angle(total)
     return out
 
 
@@ -133,22 +170,3 @@ def _interval_bounds(stamps_ns: I64, ticks_ns: I64, period_ns: int) -> tuple[Ind
     """Half-open ranges of messages: those issued in [t_k, t_{k+1})."""
     first = np.searchsorted(stamps_ns, ticks_ns - TOLERANCE_NS, side="left")
     return first, np.searchsorted(stamps_ns, _interval_ends(ticks_ns, period_ns), side="left")
-
-
-def _quaternion(axis_angle: F64) -> F64:
-    angle = float(np.linalg.norm(axis_angle))
-    return np.array([np.cos(angle / 2), *(np.sinc(angle / (2 * np.pi)) / 2 * axis_angle)])
-
-
-def _product(a: F64, b: F64) -> F64:
-    vector = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.array([a[0] * b[0] - a[1:] @ b[1:], *vector])
-
-
-def _axis_angle(q: F64) -> F64:
-    q = q if q[0] >= 0 else -q
-    sine = float(np.linalg.norm(q[1:]))
-    if sine < 1e-12:
-        return 2 * q[1:]
-    angle = 2 * np.arctan2(sine, q[0])
-    return np.asarray(q[1:] * (angle / sine))

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from vilp_data import align
-from vilp_data.decode.video_start import packets_before
 from vilp_data.errors import AlignError, LogError, SpecError, nearest
+from vilp_data.held_messages import messages_before, static_messages
+from vilp_data.sources import IndexedLog
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.transforms import ALWAYS_NS
 from vilp_data.types import F32, F64, I64, Bool, Episode, LogEpisode, LogReader, outcome_of
-from vilp_data.vector_tracks import Tracks, VectorTracks, age_name, in_time, moves_frames, stamp_ns
+from vilp_data.vector_tracks import FieldsTrack, Track, Tracks, VectorTracks, age_names, no_message, stamp_ns
+from vilp_data.video_start import packets_before
 from vilp_data.view_frames import Seen, Ticks, ViewFrames
 
 HELD_LONG_S = 1.0
@@ -35,7 +35,7 @@ class Collected:
 
 
 def assemble_episode(
-    log: LogReader, demonstration: LogEpisode, spec: TaskSpec, *, episode_id: str, scratch: Path | None = None
+    log: IndexedLog, demonstration: LogEpisode, spec: TaskSpec, *, episode_id: str, scratch: Path | None = None
 ) -> Episode:
     """One demonstration on one control clock. What of its frames does not fit in memory lies in an unnamed file in `scratch`, and is
     mapped.
@@ -46,7 +46,8 @@ def assemble_episode(
     collected = collect(log, demonstration, spec, topics, guess, scratch=scratch)
     rate_hz = spec.rate_hz or min(align.median_rate_hz(stamps) for stamps in collected.stamps_ns.values())
     refuse_short_stride(spec, collected.stamps_ns, rate_hz)
-    ticks = align.control_ticks(collected.stamps_ns or _vector_stamps(collected.tracks), rate_hz)
+    by_view = {f"view {view}": stamps for view, stamps in collected.stamps_ns.items()}
+    ticks = align.control_ticks(by_view or _vector_stamps(collected.tracks), rate_hz)
     if (
         spec.views and guess.start_ns != ticks[0] and guess.rate_hz is not None
     ):  # a first image came late: some were left out that steps see
@@ -57,8 +58,8 @@ def assemble_episode(
 
     tracks = collected.tracks
     views = {view: collected.frames[view].observe(ticks) for view in spec.views}
-    low_dim = {name: _observe_vector(table, f"low_dim.{name}", tracks, ticks) for name, table in spec.low_dim.items()}
-    state = _observe_vector(spec.state, "state", tracks, ticks) if spec.state and "state" in tracks else None
+    low_dim = {name: _observe_vector(table, tracks[f"low_dim.{name}"], ticks) for name, table in spec.low_dim.items()}
+    state = _observe_vector(spec.state, tracks["state"], ticks) if spec.state and "state" in tracks else None
     action = _actions(spec, tracks, ticks, low_dim, rate_hz)
 
     valid = {f"view {view}": images.valid for view, images in views.items()}
@@ -74,8 +75,9 @@ def assemble_episode(
             remedy="`vilp-data inspect` shows the clocks and gaps",
         )
     ages = {spec.views[view].topic: images.age_s for view, images in views.items()}
-    ages |= {age_name(spec.low_dim[name]): part.age_s for name, part in low_dim.items()}
-    ages |= {age_name(spec.action[name]): part.age_s for name, part in action.items() if spec.action[name].topic}
+    vectors = {f"low_dim.{name}": part for name, part in low_dim.items()}
+    vectors |= {f"action.{name}": part for name, part in action.items()}
+    ages |= {name: vectors[part].age_s for part, name in age_names(spec).items() if part in vectors}
     return Episode(
         id=episode_id,
         frames={view: images.frames for view, images in views.items()},
@@ -111,7 +113,7 @@ def available_topics(log: LogReader, spec: TaskSpec) -> list[str]:
 
 
 def collect(
-    log: LogReader,
+    log: IndexedLog,
     demonstration: LogEpisode,
     spec: TaskSpec,
     topics: Sequence[str],
@@ -119,8 +121,8 @@ def collect(
     *,
     scratch: Path | None = None,
 ) -> Collected:
-    """Read a demonstration's messages once: each part's in order of its topic's clock, and each view's images as far as steps see them.
-    Static transforms are read from all of the log, for they hold at all times.
+    """Read a demonstration's messages once: each part's in order of its topic's clock, and each view's images as far as steps see them;
+    and of what came before it, what still holds.
 
     Vectors are read and images decoded as they come, so that the log does not have to fit in memory."""
     views = {
@@ -130,37 +132,39 @@ def collect(
     }
     for topic, view in views.items():
         view.warm_up(packets_before(log, topic, demonstration))
-    clocks, frame_topics = spec.clocks(), moves_frames(spec)
-    stamps = {topic: array("q") for topic in views}
-    vectors = VectorTracks(spec, topics)
-    if static := vectors.static_topics & {topic.name for topic in log.topics() if topic.message_count != 0}:
-        for message in log.messages(static):
-            vectors.add_static(message)
+    vectors = VectorTracks(spec, topics, demonstration)
+    _add_held(log, demonstration, spec, vectors, topics)
     for message in log.messages(topics, start_ns=demonstration.start_ns, end_ns=demonstration.end_ns):
-        topic = message.topic
-        stamp = None if topic in frame_topics else stamp_ns(message, clocks[topic])
-        if topic in views and stamp is not None:
-            stamps[topic].append(stamp)
-            views[topic].add(message, stamp)
-        vectors.add(message, stamp)
+        if (camera := views.get(message.topic)) is not None:
+            camera.add(message, stamp_ns(message, camera.spec))
+        vectors.add(message)
+    while missed := vectors.read_again():
+        _add_held(log, demonstration, spec, vectors, missed)
+        for message in log.messages(missed, start_ns=demonstration.start_ns, end_ns=demonstration.end_ns):
+            vectors.add(message)
     where = f"{log.path}, {demonstration.name}"
     in_order: dict[str, I64] = {}
     for topic, view in views.items():
-        if not stamps[topic]:
-            remedy = "leave this log out, or take the topic out of the task TOML"
-            raise LogError(f"no message on topic {topic!r}", where=where, remedy=remedy)
-        stamps_ns, order = in_time(topic, stamps[topic])
+        if not len(view.stamps_ns):
+            raise no_message(topic, where)
+        stamps_ns, order = align.in_time(view.stamps_ns, topic=topic)
         in_order[view.view] = stamps_ns[order]
     return Collected(in_order, {view.view: view for view in views.values()}, vectors.tracks(where))
 
 
+def _add_held(
+    log: IndexedLog, demonstration: LogEpisode, spec: TaskSpec, vectors: VectorTracks, topics: Collection[str]
+) -> None:
+    """Static transforms are of all of the log; the rest came before the demonstration."""
+    for message in static_messages(log, vectors.static_topics):
+        vectors.add_static(message)
+    for message in messages_before(log, demonstration, spec, topics):
+        vectors.add(message)
+
+
 def _vector_stamps(tracks: Tracks) -> dict[str, I64]:
     """What a task without views takes its steps from: the stamps of its low_dim parts."""
-    stamps = {
-        part: track.stamps_ns[np.isfinite(track.values).all(axis=1) & (track.stamps_ns > ALWAYS_NS)]
-        for part, track in tracks.items()
-        if part.startswith("low_dim.")
-    }
+    stamps = {part: track.known_ns() for part, track in tracks.items() if part.startswith("low_dim.")}
     if short := [part for part, times in stamps.items() if not len(times)]:
         found = "nothing that ever changes, or no number"
         raise AlignError(
@@ -181,17 +185,11 @@ class _Vector:
     age_s: F32
 
 
-def _observe_vector(spec: VectorSpec, part: str, tracks: Tracks, ticks: I64) -> _Vector:
-    track = tracks[part]
-    stale_after_s = (
-        spec.stale_after_s if spec.from_frame is None else np.inf
-    )  # transforms that are too old are no numbers
-    observed = align.observe(track.stamps_ns, ticks, stale_after_s=stale_after_s)
-    latest = np.maximum(observed.index, 0)
-    values = track.values[latest]
-    values[observed.index < 0] = np.nan
-    age_s = np.where(track.stamps_ns[latest] == ALWAYS_NS, np.float32(0), observed.age_s)
-    return _Vector(values, observed.valid & _finite(values), age_s)
+def _observe_vector(spec: VectorSpec, track: Track, ticks: I64) -> _Vector:
+    latest = track.at(ticks + align.TOLERANCE_NS)
+    age_s = latest.age_s(ticks)
+    fresh = np.nan_to_num(age_s, nan=np.inf) <= spec.stale_after_s
+    return _Vector(latest.values, fresh & _storable(latest.values), age_s.astype(np.float32))
 
 
 def _actions(
@@ -214,14 +212,12 @@ def _action_part(
         source = low_dim[str(part.from_)]
         ahead = np.minimum(np.arange(len(ticks)) + part.shift, len(ticks) - 1)
         return _Vector(source.values[ahead], source.valid[ahead], np.zeros(len(ticks), np.float32))
-    stamps, values = tracks[name].stamps_ns, tracks[name].values
-    _refuse_foreign_commands(part, stamps, ticks, period_ns)
-    if part.kind == "absolute":
-        index = align.command_in_force(stamps, ticks, period_ns=period_ns)
-        held = values[np.maximum(index, 0)]
-        held[index < 0] = np.nan
-        age = np.where(index < 0, np.nan, np.maximum(ticks - stamps[np.maximum(index, 0)], 0) / 1e9)
-        return _Vector(held, _finite(held), age.astype(np.float32))
+    track = tracks[name]
+    _refuse_foreign_commands(part, track, ticks, period_ns)
+    if not isinstance(track, FieldsTrack) or part.kind == "absolute":
+        latest = track.at(align.last_instants(ticks, period_ns=period_ns))
+        return _Vector(latest.values, _storable(latest.values), latest.age_s(ticks).astype(np.float32))
+    stamps, values = track.stamps_ns, track.values
     if part.kind == "delta":
         moved = align.sum_deltas(stamps, values, ticks, period_ns=period_ns)
     elif values.shape[1] == 3:
@@ -231,31 +227,37 @@ def _action_part(
         raise SpecError(
             "a delta_rotation is an axis-angle vector of three numbers", where=part.topic, found=found, remedy=remedy
         )
-    return _Vector(moved, _finite(moved), np.zeros(len(ticks), np.float32))
+    return _Vector(moved, _storable(moved), np.zeros(len(ticks), np.float32))
 
 
 def _columns(parts: Mapping[str, _Vector], n_steps: int) -> F32:
     """The parts side by side, float32 [F,·]; zero where a value is not known (those steps are masked)."""
-    values = np.concatenate([*(part.values for part in parts.values()), np.zeros((n_steps, 0))], axis=1)
-    return np.where(np.isfinite(values), values, 0).astype(np.float32)
+    values = _as_stored(np.concatenate([*(part.values for part in parts.values()), np.zeros((n_steps, 0))], axis=1))
+    return np.where(np.isfinite(values), values, np.float32(0))
 
 
-def _finite(values: F64) -> Bool:
-    """bool [F]: rows that hold numbers only."""
-    return np.asarray(np.isfinite(values).all(axis=1))
+def _storable(values: F64) -> Bool:
+    """bool [F]: rows that hold numbers only, when stored too: what is beyond any float32 is no reading."""
+    return np.asarray(np.isfinite(_as_stored(values)).all(axis=1))
+
+
+def _as_stored(values: F64) -> F32:
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
 
 
 # --- what the user should know ------------------------------------------------------------------------------------------
 
 
-def _refuse_foreign_commands(part: ActionSpec, stamps: I64, ticks: I64, period_ns: int) -> None:
+def _refuse_foreign_commands(part: ActionSpec, track: Track, ticks: I64, period_ns: int) -> None:
     """AlignError where no command falls into the episode: deltas would all be zero, and a target held from a minute before, or
-    still to come, was stamped by another clock than the cameras."""
+    still to come, was stamped by another clock than the cameras; unless the recorder too received it so long before."""
+    stamps = track.stamps_ns
     inside = (stamps >= ticks[0] - align.TOLERANCE_NS) & (stamps < ticks[-1] + period_ns)
     if inside.any():
         return
     away_s = min(abs(int(stamps[-1]) - int(ticks[0])), abs(int(stamps[0]) - int(ticks[-1]))) / 1e9
-    if part.kind != "absolute" or away_s > FAR_S or stamps[0] >= ticks[-1]:
+    if part.kind != "absolute" or away_s > FAR_S + track.held_s or stamps[0] >= ticks[-1]:
         raise AlignError(
             "none of the commands falls into the time of the images",
             where=part.topic,

@@ -11,13 +11,31 @@ import numpy as np
 
 from vilp_data.decode.field_paths import fields_here, follow
 from vilp_data.decode.message_body import member_names, set_members
-from vilp_data.demonstrations import Marker, Span, named, spans_between_gaps, spans_by_value, spans_of_rows
+from vilp_data.demonstrations import (
+    LOG_TAG,
+    Marker,
+    Span,
+    named,
+    out_of_reach,
+    refuse_overlaps,
+    spans_between_gaps,
+    spans_by_value,
+    spans_of_rows,
+    within,
+)
 from vilp_data.episodes_spec import EpisodesSpec
 from vilp_data.errors import DecodeError, LogError, nearest
 from vilp_data.keys import digest
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import TaskSpec
+from vilp_data.topic_times import times_in_index, times_of
 from vilp_data.types import I64, LogEpisode, Message
+
+RULES_VERSION = 1
+"""Raised when the same log and the same rule give other spans than before: what is remembered of logs then counts no more."""
+
+BOUNCE_S = 0.001
+"""What a topic's value marks for less than this is a switch that bounces, whatever `min_duration_s` says."""
 
 EMPTY_MEMBER = "structure_needs_at_least_one_member"  # how ROS 2 spells a message without fields
 
@@ -56,21 +74,21 @@ def cut_log(log: IndexedLog, spec: TaskSpec, path: Path, remember: Remember = la
     if rule.kind == "file" or not natives:
         return Cuts(natives, {native.name: native.name for native in natives})
     start_ns, end_ns = natives[0].start_ns, natives[-1].end_ns
+    cuts = Cuts()
     if rule.kind == "ranges":
         spans = spans_of_rows(rule.rows, path.name, start_ns=start_ns)
+        if spec.split.group_by != LOG_TAG:
+            refuse_overlaps(spans, log=path.name)
+        cuts.notes += [f"{path}: ranges {note}" for note in out_of_reach(spans, natives)]
     else:
-        settings = digest([rule.ingest_fields(), sorted(_watched(spec)), start_ns, end_ns])
+        settings = digest([RULES_VERSION, rule.ingest_fields(), sorted(_watched(spec)), start_ns, end_ns])
         found = remember(settings, lambda: [asdict(span) for span in _spans(log, spec, start_ns, end_ns)])
         spans = [Span(**span) for span in found]
-    cuts = Cuts()
     for native in natives:
-        inside = _within(spans, native) if rule.kind != "ranges" else spans
+        inside = _leave_out_short(within(spans, native), rule, path, cuts)
         for cut in named(inside, native, log=path.name, start_ns=start_ns, alone=len(natives) == 1):
             cuts.demonstrations.append(cut)
             cuts.native[cut.name] = native.name
-    if lost := sum(not _within([span], *natives) for span in spans) if len(natives) > 1 else 0:
-        cuts.notes.append(f"{path}: {lost} of {len(spans)} ranges lie outside every demonstration of the log")
-    _leave_out_short(cuts, rule, path)
     if not cuts.demonstrations and not cuts.notes:
         cuts.notes.append(f"{path}: [episodes] finds no demonstration in it")
     return cuts
@@ -80,9 +98,10 @@ def preview(path: Path, spec: TaskSpec) -> tuple[list[CutPreview], list[str]]:
     """What `ingest` would take from a log, and sentences about what it would leave out; nothing is written."""
     with open_log(path, array_rate_hz=spec.rate_hz or 10.0) as log:
         cuts = cut_log(log, spec, path)
-        times, complete = log.message_times()
-        known = [np.sort(times[topic]) for topic in spec.topics() if topic in times] if complete else []
-        natives = log.episodes()
+        topics = [topic.name for topic in log.topics() if topic.name in spec.topics()]
+        times = times_in_index(log, topics)
+        known = [np.sort(stamps) for stamps in times.values()] if len(times) == len(topics) else []
+        natives, doubts = log.episodes(), [f"{path}: {doubt}" for doubt in log.doubts()]
     start_ns = natives[0].start_ns if natives else 0
     found = [
         CutPreview(
@@ -96,7 +115,7 @@ def preview(path: Path, spec: TaskSpec) -> tuple[list[CutPreview], list[str]]:
         )
         for cut in cuts.demonstrations
     ]
-    return found, cuts.notes
+    return found, [*cuts.notes, *doubts]
 
 
 def _count(stamps: I64, cut: LogEpisode) -> int:
@@ -104,24 +123,14 @@ def _count(stamps: I64, cut: LogEpisode) -> int:
     return int(stop - first)
 
 
-def _leave_out_short(cuts: Cuts, rule: EpisodesSpec, path: Path) -> None:
-    least_ns = rule.min_duration_s * 1e9
-    long = [cut for cut in cuts.demonstrations if cut.end_ns - cut.start_ns >= least_ns]
-    if short := len(cuts.demonstrations) - len(long):
-        cuts.notes.append(
-            f"{path}: {short} cut{'s' if short > 1 else ''} shorter than min_duration_s = {rule.min_duration_s:g} left out"
-        )
-        cuts.demonstrations = long
-
-
-def _within(spans: list[Span], *natives: LogEpisode) -> list[Span]:
-    """The parts of spans that lie in these of the log's own demonstrations."""
-    parts = (
-        (max(span.start_ns, native.start_ns), min(span.end_ns, native.end_ns), span)
-        for span in spans
-        for native in natives
-    )
-    return [Span(start_ns, end_ns, span.tags, span.name) for start_ns, end_ns, span in parts if start_ns < end_ns]
+def _leave_out_short(spans: list[Span], rule: EpisodesSpec, path: Path, cuts: Cuts) -> list[Span]:
+    """The spans that last long enough; a note says how many do not. Before they get names, for short ones come in swarms."""
+    least_s = max(rule.min_duration_s, BOUNCE_S if rule.kind == "topic" else 0.0)
+    long = [span for span in spans if span.end_ns - span.start_ns >= least_s * 1e9]
+    if short := len(spans) - len(long):
+        least = f"min_duration_s = {least_s:g}" if rule.min_duration_s >= least_s else f"{least_s:g} s"
+        cuts.notes.append(f"{path}: {short} cut{'s' if short > 1 else ''} shorter than {least} left out")
+    return long
 
 
 # --- reading ------------------------------------------------------------------------------------------------------------
@@ -142,16 +151,11 @@ def _spans(log: IndexedLog, spec: TaskSpec, start_ns: int, end_ns: int) -> list[
 
 def _times(log: IndexedLog, topics: list[str], *, required: tuple[str, ...]) -> I64:
     """The log times of every message of the topics, from the index where it tells them all."""
-    have = {topic.name: topic.message_count for topic in log.topics()}
+    have = {topic.name for topic in log.topics()}
     for topic in required:
         if topic not in have:
             raise _no_topic(log, topic)
-    present = [topic for topic in topics if topic in have]
-    times, complete = log.message_times()
-    told = {topic: times[topic] for topic in present if complete and len(times.get(topic, ())) == have[topic]}
-    if untold := [topic for topic in present if topic not in told and have[topic] != 0]:
-        told[""] = np.array([message.log_time_ns for message in log.messages(untold)], np.int64)
-    return np.concatenate([*told.values(), np.empty(0, np.int64)])
+    return times_of(log, [topic for topic in topics if topic in have])
 
 
 def _markers(log: IndexedLog, topic: str, path: str | None, *, stops: bool) -> list[Marker]:

@@ -34,6 +34,9 @@ MOST_VALUES = 12
 MOST_SOURCES, MOST_FINDINGS = 40, 20
 SHEET_SUFFIX = ".contact_sheet.png"
 
+MARKER = "<!-- written by `vilp-data card`, which may replace it -->"
+"""What makes a page a card: the only kind that is replaced without being told to."""
+
 _IDENTIFIER = re.compile(r"[A-Za-z0-9.+-]+")
 """Licences in the short form that hubs know: CC-BY-4.0."""
 
@@ -53,15 +56,25 @@ def write_card(
     licence: str | None = None,
     only: Collection[str] | None = None,
     exported: Sequence[str] = (),
+    force: bool = False,
 ) -> Path:
-    """Write the card as `path`, the contact sheet beside it; returns the sheet's path. Raises as `make_card` does."""
-    if path.is_dir():
-        raise UsageError("a folder, not a file", where=path, remedy="name a Markdown file with -o, such as README.md")
+    """Write the card as `path`, the contact sheet beside it; returns the sheet's path.
+
+    Raises UsageError where `path` is a page that somebody wrote, unless `force` is given, and as `make_card` does."""
+    _require_free(path, force=force)
     sheet = path.with_name(path.stem + SHEET_SUFFIX)
     card = make_card(store, licence=licence, only=only, exported=exported, sheet_name=sheet.name)
     shards.write_atomic(sheet, card.sheet)
     shards.write_atomic(path, card.markdown.encode())
     return sheet
+
+
+def _require_free(path: Path, *, force: bool) -> None:
+    if path.is_dir():
+        raise UsageError("a folder, not a file", where=path, remedy="name a Markdown file with -o, such as README.md")
+    if path.is_file() and not force and MARKER.encode() not in path.read_bytes():
+        remedy = "name another file with -o, or replace it with --force; what it says is nowhere else"
+        raise UsageError("a page that is no card of this command", where=path, remedy=remedy)
 
 
 def make_card(
@@ -144,7 +157,7 @@ def _front_matter(licence: str | None) -> list[str]:
         if _IDENTIFIER.fullmatch(licence)
         else ["license: other"]
     )
-    return ["---", *named, "task_categories:", "- robotics", "---"]
+    return ["---", *named, "task_categories:", "- robotics", "---", MARKER]
 
 
 def _section(title: str, lines: Iterable[str]) -> list[str]:

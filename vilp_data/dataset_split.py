@@ -6,22 +6,22 @@ none is judged by them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from vilp_data import shards
+from vilp_data import history, shards
 from vilp_data.duplicates import thumbnails
 from vilp_data.episode_files import open_frames
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError
+from vilp_data.removed import read_removed
 from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
 from vilp_data.split_lock import Side, SplitLock, assignment_hash
-from vilp_data.surgery import history
-from vilp_data.surgery.removed import read_removed
 from vilp_data.types import is_rollout
+from vilp_data.writer_lock import writer_lock
 
 
 def lock_path(root: Path) -> Path:
@@ -73,11 +73,10 @@ def update_split(
     strata: tuple[str, ...],
     redraw: bool,
 ) -> SplitLock:
-    """Draw or extend the split over all stored episodes and write it where it changed. Raises as `split.draw_split` does."""
-    with shards.writer_lock(root):
-        previous = find_split(root)
-        if previous is not None and not redraw:
-            previous = read_split(root)
+    """Draw or extend the split over all stored episodes and write it where it changed. A lock that cannot be read is no hindrance to a
+    `redraw`, and waits in history/held/. Raises as `split.draw_split` does."""
+    with writer_lock(root):
+        previous = _earlier_split(root, redraw=redraw)
         lock = draw_split(
             list(split_episodes(EpisodeStore(root), group_by, strata)),
             ratio=ratio,
@@ -94,8 +93,17 @@ def update_split(
             staged = history.stage(root, path.name)
             shards.write_atomic(staged, data)
             note = _in_words(lock, previous, redraw=redraw)
-            history.perform(root, "split", history.Changes(staged={path.name: staged}, removed=[]), note)
+            history.begin(root).perform("split", history.Changes({path.name: staged}), note)
     return lock
+
+
+def _earlier_split(root: Path, *, redraw: bool) -> SplitLock | None:
+    if redraw:
+        try:
+            return find_split(root)
+        except SplitError:
+            return None
+    return read_split(root) if lock_path(root).is_file() else None
 
 
 def _in_words(lock: SplitLock, previous: SplitLock | None, *, redraw: bool) -> str:
@@ -130,7 +138,7 @@ def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str,
                     f"no tag {tag!r}, which the split groups or spreads by",
                     where=entry.id,
                     found=f"tags {', '.join(sorted(entry.tags)) or '(none)'}",
-                    remedy="name another tag in [split], or record it in every log",
+                    remedy=f"`vilp-data relabel {entry.id} --set {tag}=…`, or name another tag in [split]",
                 )
         yield SplitEpisode(
             id=entry.id,
@@ -139,6 +147,15 @@ def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str,
             strata=tuple(entry.tags[tag] for tag in strata),
             thumbnails=_thumbnails(store, entry),
         )
+
+
+def split_by(entries: Iterable[EpisodeEntry], lock: SplitLock) -> list[SplitEpisode]:
+    """What decides of each episode with a side where it belongs, by the lock's own rule: its content, and its group's tag."""
+    return [
+        SplitEpisode(entry.id, entry.ingest_content, group=entry.tags.get(lock.group_by) if lock.group_by else None)
+        for entry in entries
+        if not is_rollout(entry.tags)
+    ]
 
 
 def _thumbnails(store: EpisodeStore, entry: EpisodeEntry) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]] | None:

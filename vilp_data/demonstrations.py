@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from vilp_data.episodes_spec import EpisodesSpec, RangeRow
-from vilp_data.errors import SpecError
+from vilp_data.errors import SpecError, some_of
 from vilp_data.types import I64, LogEpisode
 
 LOG_TAG = "log"
@@ -23,17 +24,24 @@ LOG_TAG = "log"
 CUT_TAG = "cut"
 """The tag that keeps the range as a ranges file stated it: a line that was changed or taken out is noticed by it."""
 
+SMALL_CHANGE_NS = 100_000_000
+"""A range that reaches so little past the log's end was rounded."""
+
+SHOWN_RANGES = 5
+
 FALSE_WORDS = frozenset({"", "0", "false", "off", "no", "none", "stop", "stopped", "idle"})
 
 
 @dataclass(frozen=True)
 class Span:
-    """A demonstration: [start_ns, end_ns), with the tags that only it has, and the name that was given to it, if one was."""
+    """A demonstration: [start_ns, end_ns), with the tags that only it has, and the name that was given to it, if one was. `stated_ns`:
+    the start that a ranges file states, which names it even where the log begins later."""
 
     start_ns: int
     end_ns: int
     tags: dict[str, str] = field(default_factory=dict)
     name: str | None = None
+    stated_ns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -98,27 +106,75 @@ def spans_of_rows(rows: Iterable[RangeRow], log: str, *, start_ns: int) -> list[
         first, last = (
             (row.start, row.end) if row.absolute_ns else (start_ns + round(t * 1e9) for t in (row.start, row.end))
         )
-        spans.append(Span(int(first), int(last), {**row.tags, CUT_TAG: row.text}, row.name))
+        spans.append(Span(int(first), int(last), {**row.tags, CUT_TAG: row.text}, row.name, int(first)))
     return spans
 
 
 def named(spans: Sequence[Span], native: LogEpisode, *, log: str, start_ns: int, alone: bool) -> list[LogEpisode]:
-    """Spans as the demonstrations of a log, in order of time: cut to `native`, the log's own demonstration that they lie in, with its
-    tags and theirs. `alone`: the log has no other of its own. SpecError where two spans would have one name."""
+    """Spans, each within `native`, the log's own demonstration, as demonstrations with its tags and theirs, in order of time. `alone`:
+    the log has no other of its own. SpecError where two spans were given one name."""
     found: dict[str, LogEpisode] = {}
     for span in sorted(spans, key=lambda span: (span.start_ns, span.end_ns)):
-        begin_ns, end_ns = max(span.start_ns, native.start_ns), min(span.end_ns, native.end_ns)
-        if end_ns <= begin_ns and not alone:
-            continue  # it lies in another of the log's demonstrations
-        name = span.name or f"at-{(span.start_ns - start_ns) / 1e9:09.3f}s"
-        name = name if alone else f"{native.name}-{name}"
-        if name in found:
+        prefix = "" if alone else f"{native.name}-"
+        after_ns = (span.start_ns if span.stated_ns is None else span.stated_ns) - start_ns
+        names = [prefix + (span.name or _name(after_ns, digits)) for digits in (3, 6, 9)]
+        free = [name for name in names if name not in found]
+        if not free:
             raise SpecError(
-                f"two ranges are called {name!r}", where=log, remedy="give each its own name in the ranges file"
+                f"two ranges are called {names[0]!r}", where=log, remedy="give each its own name in the ranges file"
             )
         tags = {**native.tags, LOG_TAG: stem(log), **span.tags}
-        found[name] = LogEpisode(name, begin_ns, max(end_ns, begin_ns), tags)
+        found[free[0]] = LogEpisode(free[0], span.start_ns, span.end_ns, tags)
     return list(found.values())
+
+
+def _name(after_ns: int, digits: int) -> str:
+    """`at-00012.346s`; with more digits where two cuts begin in the same millisecond, as a bouncing button makes them."""
+    return f"at-{after_ns / 1e9:0{6 + digits}.{digits}f}s"
+
+
+def within(spans: Sequence[Span], *natives: LogEpisode) -> list[Span]:
+    """The parts of spans that lie in these of the log's own demonstrations."""
+    parts = (
+        replace(span, start_ns=max(span.start_ns, native.start_ns), end_ns=min(span.end_ns, native.end_ns))
+        for span in spans
+        for native in natives
+    )
+    return [part for part in parts if part.start_ns < part.end_ns]
+
+
+def refuse_overlaps(spans: Sequence[Span], *, log: str) -> None:
+    """SpecError where two ranges share time: their frames would be learnt from on one side of the split and judged by on the other."""
+    for one, two in pairwise(sorted(spans, key=lambda span: (span.start_ns, span.end_ns))):
+        if two.start_ns < one.end_ns:
+            raise SpecError(
+                "two ranges overlap, so their frames could come to lie on both sides of the split",
+                where=log,
+                found=f"{_text(one)} and {_text(two)}",
+                remedy='end one where the other begins, or keep all cuts of a log together: [split] group_by = "log"',
+            )
+
+
+def out_of_reach(spans: Sequence[Span], natives: Sequence[LogEpisode]) -> list[str]:
+    """Sentences about ranges of which some, or all, lies outside the log's demonstrations."""
+    outside, cut = [], []
+    for span in spans:
+        inside_ns = sum(part.end_ns - part.start_ns for part in within([span], *natives))
+        if not inside_ns:
+            outside.append(_text(span))
+        elif span.end_ns - span.start_ns - inside_ns > SMALL_CHANGE_NS:
+            cut.append(_text(span))
+    whole = f"the log's {(natives[-1].end_ns - natives[0].start_ns) / 1e9:.1f} s"
+    whole += f" of {len(natives)} demonstrations" * (len(natives) > 1)
+    return [
+        *([f"outside {whole}, and left out: {some_of(outside, SHOWN_RANGES)}"] if outside else []),
+        *([f"reaching outside {whole}, and cut there: {some_of(cut, SHOWN_RANGES)}"] if cut else []),
+    ]
+
+
+def _text(span: Span) -> str:
+    stated = span.tags.get(CUT_TAG, "")
+    return f"{span.name} ({stated})" if span.name else stated
 
 
 def stem(log: str) -> str:

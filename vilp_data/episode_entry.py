@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -18,13 +18,14 @@ from vilp_data.types import Outcome
 @dataclass(frozen=True)
 class Origin:
     """Where an episode came from: the log's file name, which demonstration in it, the SHA-256 of the log (of that demonstration's own
-    rows where the log can tell them apart), and the ingest spec used."""
+    rows or messages where it is one of several), the ingest spec used, and of a cut its range, as `EpisodeEntry.cut`."""
 
     source: str
     source_sha256: str
     source_episode: str
     key: str
     ingest_fields: Mapping[str, Any]
+    cut: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class EpisodeEntry:
     """What the index knows of an episode without opening its arrays.
 
     `n_steps`, `n_valid`, `n_frames`, `key` and `content_sha256` are those of what there is to read: of a trimmed episode, the part
-    that was kept. `edits` is empty for an episode as its log gave it; else it says what was changed since, see `edits`."""
+    that was kept. `edits` is empty for an episode as its log gave it; else it says what was changed since, see `edits`. `cut` is empty
+    unless the task cut it out of its log: {"start_ns", "end_ns", "topics"}, the messages that `source_sha256` is of."""
 
     id: str
     source: str
@@ -52,6 +54,7 @@ class EpisodeEntry:
     has_action: bool
     has_state: bool
     edits: Mapping[str, Any] = field(default_factory=dict)
+    cut: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def is_trimmed(self) -> bool:
@@ -92,7 +95,8 @@ class EpisodeEntry:
         return sha256 if count == self.stored_frames(view) else f"{sha256}[{first}:{first + count}]"
 
 
-_JSON_FIELDS = ("ingest", "tags", "findings", "frames_sha256", "n_frames", "edits")
+_JSON_FIELDS = ("ingest", "tags", "findings", "frames_sha256", "n_frames", "edits", "cut")
+_OFTEN_EMPTY = ("edits", "cut")
 _TEXT_FIELDS = ("id", "source", "source_sha256", "source_episode", "key", "outcome", "content_sha256")
 INDEX_SCHEMA = pa.schema(
     [(name, pa.string()) for name in (*_TEXT_FIELDS, *_JSON_FIELDS)]
@@ -101,14 +105,20 @@ INDEX_SCHEMA = pa.schema(
 )
 
 
+def free_id(name: str, taken: Collection[str], *hashes: str) -> str:
+    """`name`, or where that is taken `name` with the first digits of the first hash, else with a whole one."""
+    suffixes = ("", f"-{hashes[0][:8]}", *(f"-{sha256}" for sha256 in hashes))
+    return next(name + suffix for suffix in suffixes if name + suffix not in taken)
+
+
 def header_of(entry: EpisodeEntry) -> dict[str, str]:
-    """The header of the entry's steps file. An episode without edits says nothing of them, as before there were any."""
+    """The header of the entry's steps file. An episode without edits says nothing of them, nor one that is no cut of being one."""
     row: dict[str, Any] = {"format": FORMAT_VERSION, **entry.__dict__}
     row |= {"has_action": int(entry.has_action), "has_state": int(entry.has_state)}
-    if not entry.edits:
-        del row["edits"]
     return {
-        name: json.dumps(value, sort_keys=True) if name in _JSON_FIELDS else str(value) for name, value in row.items()
+        name: json.dumps(value, sort_keys=True) if name in _JSON_FIELDS else str(value)
+        for name, value in row.items()
+        if value or name not in _OFTEN_EMPTY
     }
 
 
@@ -120,11 +130,11 @@ def row_of(entry: EpisodeEntry, file_bytes: int) -> dict[str, Any]:
 
 def entry_of(row: Mapping[str, Any]) -> EpisodeEntry:
     """The entry of a steps file's header, or of a row of index.parquet. Raises KeyError or ValueError for something else."""
-    parsed = {name: _parsed(row.get(name) or "{}" if name == "edits" else row[name]) for name in _JSON_FIELDS}
+    parsed = {name: _parsed(row.get(name) or "{}" if name in _OFTEN_EMPTY else row[name]) for name in _JSON_FIELDS}
     return EpisodeEntry(
         **{name: row[name] for name in _TEXT_FIELDS},
         ingest=parsed["ingest"], tags=parsed["tags"], findings=tuple(parsed["findings"]),
-        frames_sha256=parsed["frames_sha256"], n_frames=parsed["n_frames"], edits=parsed["edits"],
+        frames_sha256=parsed["frames_sha256"], n_frames=parsed["n_frames"], edits=parsed["edits"], cut=parsed["cut"],
         n_steps=int(row["n_steps"]), n_valid=int(row["n_valid"]), rate_hz=float(row["rate_hz"]),
         has_action=bool(int(row["has_action"])), has_state=bool(int(row["has_state"])),
     )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -12,20 +13,20 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vilp_data import shards
+from vilp_data import journal, shards
+from vilp_data.edits import Arrays, Edits, content_hash, edited
 from vilp_data.episode_entry import INDEX_SCHEMA, EpisodeEntry, Origin, entry_of, header_of, row_of
 from vilp_data.errors import StoreError, UsageError, nearest
 from vilp_data.keys import FORMAT_VERSION, content_digest
 from vilp_data.spec import TaskSpec, task_from_dict
-from vilp_data.surgery import journal
-from vilp_data.surgery.edits import Arrays, Edits, content_hash, edited
 from vilp_data.types import U8, Episode
+from vilp_data.writer_lock import await_settled
 
 __all__ = ["EpisodeEntry", "EpisodeStore", "Origin"]
 
 
 class EpisodeStore:
-    """The episodes of one dataset folder. Reading needs no lock; writing belongs inside `shards.writer_lock(root)`."""
+    """The episodes of one dataset folder. Reading needs no lock; writing belongs inside `writer_lock(root)`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -49,13 +50,15 @@ class EpisodeStore:
         path = self.root / "dataset.json"
         try:
             table = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(table, dict):
+                raise TypeError("JSON, but no table")
         except FileNotFoundError as error:
             raise UsageError(
                 "not a dataset: it has no dataset.json",
                 where=self.root,
                 remedy="make one with `vilp-data ingest LOGS… --task NAME`",
             ) from error
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             raise StoreError(
                 "damaged", where=path, found=str(error), remedy="run `vilp-data ingest` again: it writes this file anew"
             ) from error
@@ -66,7 +69,7 @@ class EpisodeStore:
                 found=f"format {table.get('format')}, this is {FORMAT_VERSION}",
                 remedy="ingest the logs again into a new folder",
             )
-        return task_from_dict(table["spec"], where=str(path))
+        return task_from_dict(table.get("spec", {}), where=str(path))
 
     def task_name(self) -> str | None:
         """The name of the task this dataset was ingested for; None where dataset.json is missing or damaged, as after a crash."""
@@ -88,25 +91,39 @@ class EpisodeStore:
     # --- writing
 
     def write(self, episode: Episode, origin: Origin, *, edits: Edits | None = None, hold: Path | None = None) -> None:
+        """Write an episode. See `commit`."""
+        entry, steps = describe(episode, origin)
+        self.commit(entry, steps, episode.frames, edits=edits, hold=hold)
+
+    def commit(
+        self, entry: EpisodeEntry, steps: Arrays, frames: Mapping[str, U8], *, edits: Edits | None = None, hold: Path | None = None
+    ) -> None:  # fmt: skip
         """Write an episode's frames, then its steps. A crash in between leaves no episode, only frames that the next run replaces.
 
         `edits` are what people decided about an earlier ingest of the same log: they are done to this one too. `hold` is the folder
         in which files that are replaced stay for an undo. Raises UsageError where a trim leaves too little, before anything is written."""
-        frames_sha256 = {view: content_digest(frames) for view, frames in episode.frames.items()}
-        entry, tensors = _entry_and_steps(episode, origin, frames_sha256)
+        key = entry.key
         if edits is not None:
-            entry, tensors = edited(entry, tensors, edits)
-        steps = self.steps_path(episode.id)
-        for path in (steps, *(self.frames_path(view, episode.id) for view in episode.frames)):
-            if hold is not None and path.is_file():
-                journal.keep_link(path, hold / path.relative_to(self.root))
-        if steps.is_file():
-            steps.unlink()  # the commit goes first, and comes back last
-            shards.sync_folder(steps.parent)
-        for view, frames in episode.frames.items():
-            header = {"format": str(FORMAT_VERSION), "key": origin.key, "frames_sha256": frames_sha256[view]}
-            shards.write_shard(self.frames_path(view, episode.id), {"frames": frames}, header)
-        write_steps(steps, entry, tensors)
+            entry, steps = edited(entry, steps, edits)
+        path = self.steps_path(entry.id)
+        for replaced in (path, *(self.frames_path(view, entry.id) for view in frames)):
+            if hold is not None and replaced.is_file():
+                journal.keep_link(replaced, hold / replaced.relative_to(self.root))
+        if path.is_file():
+            path.unlink()  # the commit goes first, and comes back last
+            shards.sync_folder(path.parent)
+        for view, images in frames.items():
+            header = {"format": str(FORMAT_VERSION), "key": key, "frames_sha256": entry.frames_sha256[view]}
+            shards.write_shard(self.frames_path(view, entry.id), {"frames": images}, header)
+        write_steps(path, entry, steps)
+
+    def rewrite_entry(self, entry: EpisodeEntry, *, hold: Path | None = None) -> None:
+        """Write an episode's steps file anew under another entry, its arrays as they are. `hold` as in `commit`."""
+        path = self.steps_path(entry.id)
+        steps = shards.read_shard(path).arrays
+        if hold is not None:
+            journal.keep_link(path, hold / path.relative_to(self.root))
+        write_steps(path, entry, steps)
 
     def remove_index(self) -> None:
         """Before episodes change: an index that is not there is rebuilt, one that is wrong is believed."""
@@ -120,11 +137,18 @@ class EpisodeStore:
         with shards.atomic_file(self.index_path) as file:
             pq.write_table(pa.Table.from_pylist(rows, schema=INDEX_SCHEMA), file)
 
+    def ensure_index(self) -> bool:
+        """Write the index where a writer that was stopped could not any more; whether there was none."""
+        if self.index_path.is_file() or not self._steps_files():
+            return False
+        self.write_index()
+        return True
+
     # --- reading
 
     def index(self) -> list[EpisodeEntry]:
         """Every committed episode, sorted by id. Read from index.parquet where that fits the folder, else from the headers."""
-        journal.await_settled(self.root)
+        await_settled(self.root)
         sizes = {path.name.removesuffix(".safetensors"): path.stat().st_size for path in self._steps_files()}
         if self.index_path.is_file():
             try:
@@ -216,9 +240,9 @@ def write_steps(path: Path, entry: EpisodeEntry, steps: Arrays) -> None:
     shards.write_shard(path, steps, header_of(entry))
 
 
-def _entry_and_steps(
-    episode: Episode, origin: Origin, frames_sha256: dict[str, str]
-) -> tuple[EpisodeEntry, dict[str, npt.NDArray[Any]]]:
+def describe(episode: Episode, origin: Origin) -> tuple[EpisodeEntry, dict[str, npt.NDArray[Any]]]:
+    """The entry and the arrays of an episode as its log gives it. Hashes every frame."""
+    frames_sha256 = {view: content_digest(frames) for view, frames in episode.frames.items()}
     steps: dict[str, npt.NDArray[Any]] = {
         "log_time_ns": episode.log_time_ns,
         "low_dim": episode.low_dim,
@@ -234,6 +258,6 @@ def _entry_and_steps(
         n_valid=int(np.count_nonzero(episode.valid)), rate_hz=episode.rate_hz, outcome=episode.outcome,
         tags=dict(episode.tags), findings=tuple(episode.findings), frames_sha256=frames_sha256,
         n_frames={view: len(frames) for view, frames in episode.frames.items()}, content_sha256="",
-        has_action=episode.action is not None, has_state=episode.state is not None,
+        has_action=episode.action is not None, has_state=episode.state is not None, cut=dict(origin.cut),
     )  # fmt: skip
     return replace(entry, content_sha256=content_hash(entry, steps)), steps

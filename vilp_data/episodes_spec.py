@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -13,6 +14,9 @@ from vilp_data.types import OUTCOME_TAG
 
 ABSOLUTE_NS = 10**15
 """A whole number in `start` or `end` from here on is absolute nanoseconds: as seconds it would be thirty million years."""
+
+LATEST = 2**63
+"""Nanoseconds from here on fit no clock."""
 
 _YES, _NO = ("true", "yes", "1", "success"), ("false", "no", "0", "failure")
 _COLUMNS = ("start", "end", "start_s", "end_s", "start_ns", "end_ns", "name", "log", "success")
@@ -147,13 +151,21 @@ def read_ranges(text: str, *, where: str) -> tuple[RangeRow, ...]:
 
 def _row(line: Mapping[str, str], pair: tuple[str, str], where: str) -> RangeRow:
     start, end = (_time(line[column], column, where) for column in pair)
-    absolute = pair[0] == "start_ns" or (isinstance(start, int) and start >= ABSOLUTE_NS)
+    large = [abs(time) >= ABSOLUTE_NS for time in (start, end)]
+    absolute = pair[0] == "start_ns" or all(large)
     if absolute and not (isinstance(start, int) and isinstance(end, int)):
         raise SpecError(
             "absolute times are whole nanoseconds",
             where=where,
             found=f"{start}, {end}",
             remedy="e.g. 1700000000500000000",
+        )
+    if any(large) and not absolute:
+        raise SpecError(
+            "start and end are not of one kind: one is in nanoseconds, the other in seconds",
+            where=where,
+            found=f"{start}, {end}",
+            remedy="give both as seconds from the log's start, or both as nanoseconds",
         )
     if end <= start:
         raise SpecError(
@@ -180,7 +192,11 @@ def _row(line: Mapping[str, str], pair: tuple[str, str], where: str) -> RangeRow
 
 
 def _time(text: str, column: str, where: str) -> float | int:
+    """A whole number as such, anything else in seconds. "inf" is no end: a range past the log's end is cut there anyway."""
     try:
-        return int(text) if text.lstrip("+-").isdigit() else float(text)
+        time = int(text) if text.lstrip("+-").isdigit() else float(text)
     except ValueError:
-        raise SpecError(f"{column} is no number", where=where, found=repr(text), remedy="correct that line") from None
+        time = math.nan
+    if not abs(time) < LATEST:
+        raise SpecError(f"{column} is no number", where=where, found=repr(text), remedy="correct that line")
+    return time

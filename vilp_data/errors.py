@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import shlex
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 
 class VilpDataError(Exception):
@@ -73,9 +75,41 @@ class SplitError(VilpDataError):
     """A split that cannot be drawn, or that does not fit the episodes at hand."""
 
 
+def salvage_command(log: Path) -> str:
+    """The whole command that gets back what a damaged log still holds, in backticks."""
+    clean = log.with_name(f"{Path(log.name.removesuffix('.active')).stem}-salvaged.mcap")
+    return f"`vilp-data salvage {shlex.quote(str(log))} -o {shlex.quote(str(clean))}`"
+
+
+def copy_or_salvage(log: Path) -> str:
+    """What to do about a damaged log; one that zstd packed is inflated first."""
+    if log.suffix in (".zst", ".zstd"):
+        whole = log.with_suffix("")
+        unpack = f"`zstd -d {shlex.quote(str(log))} -o {shlex.quote(str(whole))}`"
+        return f"copy it again from where it was recorded; {unpack} inflates what is there, and {salvage_command(whole)} takes that"
+    return f"copy it again from where it was recorded; {salvage_command(log)} gets back what is there"
+
+
+def reason(error: BaseException) -> str:
+    """Another library's error in one line: its own words, `no 'length'` for a key that is not there, else its name."""
+    if isinstance(error, KeyError):
+        return f"no {error}"
+    return str(error).partition("\n")[0].rstrip(":") or repr(error)
+
+
+def copy_again(what: str, *, leave: str = "") -> str:
+    """What to do about a file that no salvage reads; `leave`: what else can be left out, `this episode`."""
+    return f"copy the {what} again from its source" + (f", or leave {leave} out" if leave else "")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """A remedy that names the nearest known name: `did you mean 'rate_hz'? known: ...`."""
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}? " if close else ""
     return f"{hint}known: {', '.join(names) if names else '(none)'}"
+
+
+def some_of(names: Sequence[str], most: int) -> str:
+    """The first `most` of these names, and how many more there are: `a, b and 3 more`."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -22,7 +22,8 @@ COVERED = 0.5
 
 
 def fit_image(image: U8, height: int, width: int, fit: Fit | None) -> U8:
-    """Resize uint8 [h,w,C] to [height,width,C] with an area filter (linear where the image grows).
+    """Resize uint8 [h,w,C] to [height,width,C] with an area filter (linear where the image grows; where one side grows and the other
+    shrinks, each by its own filter).
 
     fit "crop" cuts the longer side evenly, "pad" adds black evenly, "stretch" changes the aspect ratio. None keeps all of the
     image and raises UsageError where that would change the aspect ratio. An image of the right size is returned as it is."""
@@ -32,7 +33,7 @@ def fit_image(image: U8, height: int, width: int, fit: Fit | None) -> U8:
 def fit_depth(metres: F32, height: int, width: int, fit: Fit | None) -> F32:
     """The same for readings, float32 [h,w] with NaN where there is none: each stored pixel is the mean of the readings in its area,
     and none where they cover less than half of it. A missing reading is never mixed into a distance, nor is "pad"'s border. Where
-    the image grows, the nearest reading is taken."""
+    a side grows, the nearest reading is taken."""
     return _fitted(metres, height, width, fit, _resized_readings, outside=np.nan)
 
 
@@ -80,18 +81,17 @@ def _padded(
 
 def _resized(image: U8, height: int, width: int) -> U8:
     h, w = image.shape[:2]
-    shrinks = height <= h and width <= w
-    out = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    shrunk = cv2.resize(image, (min(w, width), min(h, height)), interpolation=cv2.INTER_AREA)
+    out = cv2.resize(shrunk, (width, height), interpolation=cv2.INTER_LINEAR)  # a copy, where nothing grows
     return out.reshape(height, width, *image.shape[2:])  # type: ignore[return-value]
 
 
 def _resized_readings(metres: F32, height: int, width: int) -> F32:
     h, w = metres.shape
-    if height > h or width > w:
-        return np.asarray(cv2.resize(metres, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
-    known = ~np.isnan(metres)
-    share = cv2.resize(known.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    total = cv2.resize(np.where(known, metres, np.float32(0)), (width, height), interpolation=cv2.INTER_AREA)
+    known, shrunk = ~np.isnan(metres), (min(w, width), min(h, height))
+    share = cv2.resize(known.astype(np.float32), shrunk, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(np.where(known, metres, np.float32(0)), shrunk, interpolation=cv2.INTER_AREA)
     enough = share >= COVERED
     out = np.where(enough, total / np.where(enough, share, 1), np.float32(np.nan))
-    return np.asarray(out, np.float32)
+    # The exact one takes the reading that the new pixel's centre lies in; the other leans to the left.
+    return np.asarray(cv2.resize(out, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), np.float32)

@@ -1,62 +1,70 @@
 """What an ingest has to do: which stored episode each demonstration is, which are fresh, and what must not be mixed.
 
-A demonstration is known by its bytes (`HashCache.of_log`): by the log's where it is alone in its log, by its own rows where a log
-holds many. The same bytes are the same episode, whatever the log is called now. For bytes that are not stored:
+A demonstration is known by its bytes: by the log's where it is alone in its log (`HashCache.of_log`), by its own rows or messages where
+it is one of several (`cut_identity`). The same bytes are the same episode, whatever the log is called now. For bytes that are not stored:
 
-- A log of many demonstrations whose name is known, and in which at least half of the episodes stored from that name are found
+- A demonstration that is cut from a log, and overlaps the range of a known one that the same log still holds, is that one, cut otherwise
+  since: its log has grown, or its line in a ranges file was edited. It replaces the episode, and labels stay. Which log is the same is
+  said in `ingest_sources.Sources`.
+- A log of many demonstrations of its own whose name is known, and in which at least half of the episodes stored from that name are found
   unchanged, is the same log grown or edited: demonstrations of a new name are added, those of a known name replace their episode,
-  unless another log of this call holds that episode. `Plan.replaced` names them.
-- What was removed on purpose (`removed`) is known by its bytes too, and stays out.
+  unless another log of this call holds that episode. `Plan.replaced` names what is replaced.
+- What was removed on purpose (`removed`) is known in the same ways, and stays out.
 - Anything else is new. Where its name is taken it gets the first digits of its hash as a suffix: logs of several days may all be
-  called run.mcap, and none may overwrite another. `Plan.notes` says so.
+  called run.mcap, and none may overwrite another. `Plan.notes` says so. Whether it shows the same as a known episode, its log having
+  been written anew in other bytes, is seen once it is decoded: `Plan.known`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 
-from vilp_data.cut_log import cut_log
-from vilp_data.demonstrations import CUT_TAG
+from vilp_data.cut_identity import Cut
+from vilp_data.demonstrations import CUT_TAG, LOG_TAG
+from vilp_data.edits import Edits, edits_of, restated
+from vilp_data.episode_entry import free_id
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import DecodeError, LogError, SpecError, UsageError
-from vilp_data.keys import digest, episode_key, first_difference
+from vilp_data.errors import UsageError, some_of
+from vilp_data.ingest_sources import KnownCut, Source, Sources, read_sources
+from vilp_data.keys import episode_key, first_difference
 from vilp_data.log_hashes import HashCache
-from vilp_data.sources import open_log
+from vilp_data.removed import Removed, RemovedEpisode, read_removed
 from vilp_data.spec import TaskSpec
-from vilp_data.surgery.edits import Edits, edits_of
-from vilp_data.surgery.removed import Removed, read_removed
-from vilp_data.types import LogEpisode, is_rollout, outcome_of
-
-
-@dataclass(frozen=True)
-class Source:
-    """One demonstration of one log, before it is known which episode it is. `alone`: its log holds no other."""
-
-    log: Path
-    demonstration: LogEpisode
-    sha256: str
-    alone: bool
+from vilp_data.types import is_rollout, outcome_of
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A demonstration that is to be ingested, as the episode `id`; `edits` are what people did to it since its last ingest."""
+    """A demonstration that is to be ingested, as the episode `id`; `edits` are what people did to it since its last ingest. `is_new`: it
+    is no episode that is known by its bytes or its place in a log."""
 
     id: str
     source: Source
     key: str
     edits: Edits | None = None
+    is_new: bool = True
+
+
+@dataclass(frozen=True)
+class KnownContent:
+    """What shows an episode to be a known one: `tick_ns` is the time of its step `step`, None where nobody remembers. `removed`: what
+    people had decided about one that was removed, None for a stored one."""
+
+    id: str
+    step: int
+    tick_ns: int | None = None
+    removed: Edits | None = None
 
 
 @dataclass
 class Plan:
     """`todo` in order of logs; ids of what is fresh, left out as a failure, a policy's `rollouts` left out, `removed` on purpose before,
-    `replaced` by what is to do; what could not be read (name, why); sentences about names that are not what they were; `rate_hz` of
-    the episodes that stay, None where none do."""
+    `replaced` by what is to do; `restated`: entries of fresh ones of which the task says something else now; what could not be read
+    (name, why); sentences about names that are not what they were; `rate_hz` of the episodes that stay, None where none do;
+    `known`: content hash -> the episodes of that content that are stored, or were removed."""
 
     todo: list[Planned] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
@@ -64,9 +72,11 @@ class Plan:
     rollouts: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
     replaced: set[str] = field(default_factory=set)
+    restated: list[EpisodeEntry] = field(default_factory=list)
     failed: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     rate_hz: float | None = None
+    known: dict[str, tuple[KnownContent, ...]] = field(default_factory=dict)
 
 
 def make_plan(
@@ -81,23 +91,20 @@ def make_plan(
 ) -> Plan:
     """Compare logs with the store. What was removed on purpose stays out, unless it is wanted `again`. Raises UsageError where the
     dataset is of another task, or where episodes ingested by another spec would stay in it."""
-    plan = Plan()
-    fields = spec.ingest_fields()
-    present = {entry.id: entry for entry in store.index()}
+    plan, fields = Plan(), spec.ingest_fields()
+    present, removed = {entry.id: entry for entry in store.index()}, read_removed(store.root)
     _refuse_another_task(store, spec, present)
-    sources, removed = read_sources(logs, spec, cache, plan), read_removed(store.root)
+    sources = read_sources(logs, spec, cache, known_cuts(present.values(), removed))
+    plan.failed, plan.notes = sources.failed, sources.notes
     for source, episode_id in identify(sources, list(present.values()), plan, removed):
-        entry = present.get(episode_id)
-        if entry is None and episode_id in removed and not again:
+        entry, gone = present.get(episode_id), removed.get(episode_id)
+        if entry is None and gone is not None and not again:
             plan.removed.append(episode_id)
             continue
-        edits = _edits_to_keep(entry, source, plan)
-        name = source.demonstration.name
-        if entry is not None and entry.source_sha256 == source.sha256:
-            name = entry.source_episode  # a store past its thousandth demonstration counts them with one more digit
-        key = episode_key(source_sha256=source.sha256, source_episode=name, ingest_fields=fields)
-        if entry is not None and entry.ingest_key == key and store.frames_fit(entry):
+        edits = _edits_to_keep(episode_id, entry or gone, source, plan)
+        if entry is not None and _is_fresh(store, entry, source, fields):
             plan.fresh.append(episode_id)
+            plan.notes += _restate(entry, source, plan, spec)
         elif is_rollout(source.demonstration.tags) and not with_rollouts:
             plan.rollouts.append(episode_id)
         elif not include_failures and _failed(source, edits):
@@ -106,90 +113,119 @@ def make_plan(
             key = episode_key(
                 source_sha256=source.sha256, source_episode=source.demonstration.name, ingest_fields=fields
             )
-            plan.todo.append(Planned(episode_id, source, key, edits))
+            plan.todo.append(Planned(episode_id, source, key, edits, is_new=entry is None and gone is None))
     settled = {*plan.fresh, *(planned.id for planned in plan.todo)}
-    plan.notes += _no_longer_cut(sources, [entry for entry in present.values() if entry.id not in settled], spec)
-    _refuse_another_spec(store, [entry for entry in present.values() if entry.id not in settled], fields)
+    staying = [entry for entry in present.values() if entry.id not in settled]
+    plan.notes += _no_longer_cut(sources.found, staying, spec)
+    _refuse_another_spec(store, staying, fields)
     plan.replaced &= {planned.id for planned in plan.todo}
     plan.rate_hz = next((entry.rate_hz for entry in present.values() if entry.ingest == fields), None)
+    at_rest = present.keys() - {planned.id for planned in plan.todo}
+    plan.known = known_contents([present[id] for id in sorted(at_rest)], removed)
     return plan
 
 
-def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, plan: Plan) -> list[Source]:
-    """Every demonstration of the logs, those with the same bytes once; logs that cannot be read go to `plan.failed`."""
-    sources: dict[str, Source] = {}
-    for path in logs:
-        try:
-            with open_log(path, array_rate_hz=spec.rate_hz or 10.0) as log:
-                natives = log.episodes()
-                hashes = cache.of_log(log, path, natives)
-                cuts = cut_log(log, spec, path, partial(cache.of_look, path))
-        except (LogError, DecodeError, SpecError) as error:
-            plan.failed.append((path.name, str(error)))
-            continue
-        plan.notes += cuts.notes
-        if not natives:
-            empty = LogError("the log holds no message", where=path, remedy="leave it out")
-            plan.failed.append((path.name, str(empty)))
-        is_cut = spec.episodes.kind != "file"
-        for demonstration in cuts.demonstrations:
-            sha256 = hashes[cuts.native[demonstration.name]]
-            if is_cut:  # known by its own range of the log's bytes
-                sha256 = digest({"log": sha256, "start_ns": demonstration.start_ns, "end_ns": demonstration.end_ns})
-            source = Source(path, demonstration, sha256, alone=len(natives) == 1 and not is_cut)
-            first = sources.setdefault(sha256, source)
-            if first is not source:
-                copied = "" if first.alone else f", {first.demonstration.name}"
-                plan.notes.append(f"{path}: a copy of {first.log}{copied}, byte for byte; taken once")
-    return list(sources.values())
+def known_cuts(entries: Iterable[EpisodeEntry], removed: Removed) -> list[KnownCut]:
+    """Every cut that is stored or was removed."""
+    rows = [(entry.id, entry.source, entry.source_sha256, entry.cut) for entry in entries]
+    rows += [(id, one.source, one.source_sha256, one.cut) for id, one in removed.items()]
+    return [KnownCut(id, log, sha256, cut) for id, log, sha256, table in rows if (cut := Cut.from_json(table))]
+
+
+def known_contents(entries: Iterable[EpisodeEntry], removed: Removed) -> dict[str, tuple[KnownContent, ...]]:
+    """Content hash, as ingest gives it -> what is known to show that."""
+    found: dict[str, tuple[KnownContent, ...]] = {}
+    for entry in entries:
+        one = KnownContent(entry.id, entry.first_step)
+        found[entry.ingest_content] = (*found.get(entry.ingest_content, ()), one)
+    for id, gone in removed.items():
+        step = int(gone.edits.get("trim", {}).get("first_step", 0))
+        one = KnownContent(id, step, gone.tick_ns, edits_of(gone.edits))
+        found[gone.ingest_content] = (*found.get(gone.ingest_content, ()), one)
+    return found
 
 
 def identify(
-    sources: Sequence[Source], entries: Sequence[EpisodeEntry], plan: Plan, removed: Removed | None = None
+    sources: Sources, entries: Sequence[EpisodeEntry], plan: Plan, removed: Removed | None = None
 ) -> list[tuple[Source, str]]:
     """The episode id of each source, by the rule above; fills `plan.replaced` and `plan.notes`. What was removed keeps its id."""
     removed = removed or {}
-    stored = {entry.source_sha256: entry for entry in entries}
-    gone = {episode.source_sha256: id for id, episode in removed.items()}
-    claimed = {stored[source.sha256].id for source in sources if source.sha256 in stored}
+    by_hash = {episode.source_sha256: id for id, episode in removed.items()}
+    by_hash |= {entry.source_sha256: entry.id for entry in entries}
+    claimed = {by_hash[source.sha256] for source in sources.found if source.sha256 in by_hash}
     taken = {*removed, *(entry.id for entry in entries)}
     found: list[tuple[Source, str]] = []
-    for log, group in groupby(sources, key=lambda source: source.log):
+    for log, group in groupby(sources.found, key=lambda source: source.log):
         members = list(group)
         unclaimed = [entry for entry in entries if entry.source == log.name and entry.id not in claimed]
         replaceable = _replaceable(members, entries, unclaimed)
+        replaceable |= _overlapped(members, [one for one in sources.held.get(log, ()) if one.id not in claimed])
         new: list[str] = []
         for source in members:
-            if source.sha256 in stored:
-                episode_id = stored[source.sha256].id
-            elif source.sha256 in gone:
-                episode_id = gone[source.sha256]
-            elif source.demonstration.name in replaceable:
-                episode_id = replaceable[source.demonstration.name]
-                plan.replaced.add(episode_id)
+            name = source.demonstration.name
+            if source.sha256 in by_hash:
+                episode_id = by_hash[source.sha256]
+            elif name in replaceable:
+                episode_id = replaceable[name]
+                plan.replaced |= {episode_id} - removed.keys()
             else:
-                episode_id = _free_id(source, taken)
+                episode_id = free_id(_name_of(source), taken, source.sha256)
                 new.append(episode_id)
             taken.add(episode_id)
             found.append((source, episode_id))
-        if new and unclaimed and not any(source.sha256 in stored for source in members):
+        known = any(source.sha256 in by_hash or source.demonstration.name in replaceable for source in members)
+        if new and unclaimed and not known:
             ids = new[0] if len(new) == 1 else f"{new[0]} and {len(new) - 1} more"
             plan.notes.append(f"{log}: not the {log.name} ingested before; both are kept, this one as {ids}")
     return found
 
 
-def _edits_to_keep(entry: EpisodeEntry | None, source: Source, plan: Plan) -> Edits | None:
-    """What people did to the stored episode, where this source is the same demonstration; where it is another, a note says it is lost."""
-    edits = edits_of(entry) if entry is not None else Edits()
-    if entry is None or not edits.any:
+def _is_fresh(store: EpisodeStore, entry: EpisodeEntry, source: Source, fields: Mapping[str, object]) -> bool:
+    """Whether the store holds just what an ingest of the source would give today."""
+    same = entry.source_sha256 == source.sha256 and first_difference(entry.ingest, fields) is None
+    return same and store.frames_fit(entry)
+
+
+def _restate(entry: EpisodeEntry, source: Source, plan: Plan, spec: TaskSpec) -> list[str]:
+    """What the task says of a stored cut today goes into `plan.restated`; what it means, in words. The name of its log stays: of the same
+    bytes under two names none is righter."""
+    if source.cut is None:
+        return []
+    tags, name = dict(source.demonstration.tags), source.demonstration.name
+    tags |= {LOG_TAG: entry.tags[LOG_TAG]} if LOG_TAG in entry.tags else {}
+    today = replace(restated(entry, tags), source_episode=name)
+    if today == entry:
+        return []
+    plan.restated.append(today)
+    notes = []
+    if name != entry.source_episode:
+        notes.append(f"{entry.id}: called {name} in {spec.episodes.by} now; the episode keeps its id")
+    if today.outcome == "failure" != entry.outcome:
+        notes.append(
+            f"{entry.id}: a failure now, and still stored; `vilp-data remove {entry.id}` takes it out of training"
+        )
+    return notes
+
+
+def _edits_to_keep(id: str, known: EpisodeEntry | RemovedEpisode | None, source: Source, plan: Plan) -> Edits | None:
+    """What people did to the known episode, where this source is the same demonstration. Of one that is cut otherwise now, the labels;
+    where it is another, none. A note says what is lost."""
+    edits = edits_of(known.edits) if known is not None else Edits()
+    if known is None or not edits.any:
         return None
-    if entry.source_sha256 == source.sha256:
+    was = Cut.from_json(known.cut)
+    cut_otherwise = was is not None and source.cut is not None and was.range != source.cut.range
+    other_topics = was is not None and source.cut is not None and was.topics != source.cut.topics
+    if known.source_sha256 == source.sha256 or (other_topics and not cut_otherwise):
         return edits
-    lost = " and ".join(["its labels"] * bool(edits.set or edits.unset) + ["its trim"] * (edits.start_ns is not None))
-    plan.notes.append(
-        f"{entry.id}: the log changed, so {lost} no longer hold; `vilp-data undo` brings the episode back as it was"
-    )
-    return None
+    lost = ["its labels"] * (bool(edits.set or edits.unset) and not cut_otherwise)
+    lost += ["its trim"] * (edits.start_ns is not None)
+    if lost:
+        plan.notes.append(
+            f"{id}: {'it is cut otherwise now' if cut_otherwise else 'the log changed'}, so {' and '.join(lost)} no longer "
+            f"{'holds' if lost == ['its trim'] else 'hold'}; `vilp-data undo` brings the episode back as it was"
+        )
+    return replace(edits, start_ns=None, end_ns=None) if cut_otherwise else None
 
 
 def _failed(source: Source, edits: Edits | None) -> bool:
@@ -204,17 +240,30 @@ def _replaceable(
     hashes = {source.sha256 for source in members}
     same_name = [entry for entry in entries if entry.source == members[0].log.name]
     kept = sum(entry.source_sha256 in hashes for entry in same_name)
-    if members[0].alone or kept == 0 or 2 * kept < len(same_name):
+    if members[0].alone or members[0].cut is not None or kept == 0 or 2 * kept < len(same_name):
         return {}
     return {entry.source_episode: entry.id for entry in unclaimed}
 
 
-def _free_id(source: Source, taken: set[str]) -> str:
-    """The log's name, with the demonstration's where there are several; made a visible file name, and unique."""
+def _overlapped(members: Sequence[Source], held: Sequence[KnownCut]) -> dict[str, str]:
+    """Demonstration name -> the known cut that it overlaps longest, each of them once."""
+    pairs = sorted(
+        (-overlap_ns, source.demonstration.name, known.id)
+        for source in members
+        for known in held
+        if source.cut is not None and (overlap_ns := source.cut.overlap_ns(known.cut)) > 0
+    )
+    found: dict[str, str] = {}
+    for _, name, id in pairs:
+        if name not in found and id not in found.values():
+            found[name] = id
+    return found
+
+
+def _name_of(source: Source) -> str:
+    """The log's name, with the demonstration's where there are several; made a visible file name."""
     name = source.log.stem if source.alone else f"{source.log.stem}-{source.demonstration.name}"
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).lstrip(".") or "episode"
-    candidates = (name, f"{name}-{source.sha256[:8]}", f"{name}-{source.sha256}")
-    return next(candidate for candidate in candidates if candidate not in taken)
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name).lstrip(".") or "episode"
 
 
 def _no_longer_cut(sources: Sequence[Source], others: Sequence[EpisodeEntry], spec: TaskSpec) -> list[str]:
@@ -224,8 +273,11 @@ def _no_longer_cut(sources: Sequence[Source], others: Sequence[EpisodeEntry], sp
         entry.id for entry in others
         if entry.source in given and spec.episodes.kind == "ranges" and entry.tags.get(CUT_TAG, "") not in (*stated, "")
     ]  # fmt: skip
-    listed = ", ".join(gone[:5]) + (f" and {len(gone) - 5} more" if len(gone) > 5 else "")
-    return [f"{listed}: stored, and no longer in {spec.episodes.by}; `vilp-data remove` takes them out"] if gone else []
+    return (
+        [f"{some_of(gone, 5)}: stored, and no longer in {spec.episodes.by}; `vilp-data remove` takes them out"]
+        if gone
+        else []
+    )
 
 
 # --- what must not be mixed ------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from vilp_data.keys import digest, ingest_key
 from vilp_data.latents import LatentJob, encode_episodes, load_encoder, missing_latents, open_latents
 from vilp_data.spec import TaskSpec
 from vilp_data.stats import ChannelStats
+from vilp_data.writer_lock import remove_leftovers, writer_lock
 
 EncodingProgress = Callable[[int, int, float], None]
 """Told (frames done, frames in all, frames/s that bare forward passes of the same workers would reach)."""
@@ -87,7 +88,8 @@ def encode_dataset(
     if not all(encoder.parallel for encoder in encoders.values()):
         workers = 1
     done = EncodedDataset({view: encoder.key for view, encoder in encoders.items()})
-    with shards.writer_lock(root):
+    with writer_lock(root):
+        remove_leftovers(root)
         train = side_episodes(store, "train") if find_split(root) is not None else []
         jobs = missing_latents(store, encoder_name, run_dir, done.keys)
         _encode(store, jobs, done, workers=max(1, min(workers, len(jobs))), progress=progress)

@@ -165,7 +165,7 @@ def encode_episodes(
     jobs: Sequence[LatentJob], *, workers: int
 ) -> Generator[tuple[LatentJob, EncodedShard], None, None]:
     """Make the shards, yielding each as it is done. Workers compute on one thread each, this process included while it is the
-    only one, so bytes do not depend on how many there are. Call inside `shards.writer_lock`, and close the generator before
+    only one, so bytes do not depend on how many there are. Call inside `writer_lock`, and close the generator before
     letting go of it. Killed at any moment, the next call makes what is missing."""
     made = map_unordered(encode_one, jobs, workers=workers, initializer=_compute_on_one_thread)
     with _threads_restored(), contextlib.closing(made):

@@ -1,6 +1,6 @@
 """How much a log may ask for before it is believed to be broken or hostile: one named number each, with its reason.
 
-A header of a few bytes can claim terabytes. Whatever allocates, recurses or opens a path on a log's word asks here first. Each limit
+A header of a few bytes can claim terabytes. What allocates, recurses or opens a path on a log's word asks here first. Each limit
 is far above anything a recorder writes; a log that truly needs more is read with the environment variable that the error names
 (`VILP_MAX_CHUNK_BYTES=4GiB vilp-data inspect run.mcap`).
 """
@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
-from vilp_data.errors import LogError, UsageError
+from vilp_data.errors import LogError, UsageError, salvage_command
 
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30}
 
@@ -28,6 +28,10 @@ def _limit(name: str, default: int, environment: Mapping[str, str] = os.environ)
 
 CHUNK_BYTES = _limit("CHUNK_BYTES", 1 << 30)
 """A chunk when inflated. Recorders write 0.5 to 16 MB; single-chunk files of a few hundred MB exist."""
+
+ARRAY_CHUNK_BYTES = _limit("ARRAY_CHUNK_BYTES", 256 << 20)
+"""Rows of an array that can only be read together: a chunk of HDF5, a row of chunks of zarr, one row of a table. A whole camera's
+episode in one chunk, as some writers leave it, is 80 MB."""
 
 RECORD_BYTES = _limit("RECORD_BYTES", 1 << 30)
 """One record (a message, a schema, a summary) that is held in memory whole. The largest messages, dense point clouds and raw
@@ -51,11 +55,14 @@ NAME_BYTES = 200
 
 def exceeded(what: str, name: str, found: int, *, where: object) -> LogError:
     """The error for a log that asks for more than the limit `name`, with the way to raise it."""
+    rest = ""
+    if isinstance(where, Path) and where.suffix in (".mcap", ".bag", ".db3", ".active"):
+        rest = f" ({salvage_command(where)} reads the rest)"
     return LogError(
         f"{what} claims more than any recorder writes",
         where=where,
         found=f"{found:,} where {globals()[name]:,} are allowed",
-        remedy=f"the log is probably damaged (`vilp-data salvage` reads the rest); if not, set VILP_MAX_{name}={found}",
+        remedy=f"the log is probably damaged{rest}; if not, set VILP_MAX_{name}={found}",
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from vilp_data import shards
 from vilp_data.keys import digest
+from vilp_data.sources.folder_hash import log_files
 from vilp_data.types import LogEpisode, LogReader
 
 SETTLED_AFTER_S = 2.0
@@ -41,20 +42,20 @@ class HashCache:
     def of_log(self, log: LogReader, path: Path, demonstrations: list[LogEpisode]) -> dict[str, str]:
         """Demonstration name -> SHA-256, lower-case hex: of the log, where it holds only one; else of its part of the log."""
         names = [demonstration.name for demonstration in demonstrations]
-        place, (look, newest) = str(path.resolve()), _look_of(path)
+        place, (stats, newest) = str(path.resolve()), _file_stats(path)
         known = self._known.get(place)
-        if isinstance(known, dict) and known.get("look") == look and list(known.get("sha256", ())) == names:
+        if isinstance(known, dict) and known.get("files") == stats and list(known.get("sha256", ())) == names:
             return dict(known["sha256"])
         hashes = _hash(log, names)
         if time.time() - newest > SETTLED_AFTER_S:
-            self._known[place] = {"look": look, "sha256": hashes}
+            self._known[place] = {"files": stats, "sha256": hashes}
             self._changed = True
         return hashes
 
-    def of_look(self, path: Path, what: str, find: Callable[[], Any]) -> Any:
+    def remembered(self, path: Path, what: str, find: Callable[[], Any]) -> Any:
         """Plain data about a log that `of_log` was asked for: `find()`, remembered under `what`."""
         known = self._known.get(str(path.resolve()))
-        if not isinstance(known, dict) or known.get("look") != _look_of(path)[0]:
+        if not isinstance(known, dict) or known.get("files") != _file_stats(path)[0]:
             return find()
         found = known.setdefault("found", {})
         if what not in found:
@@ -76,9 +77,8 @@ def _hash(log: LogReader, names: list[str]) -> dict[str, str]:
     return {name: whole if len(names) == 1 else digest({"log": whole, "demonstration": name}) for name in names}
 
 
-def _look_of(path: Path) -> tuple[str, float]:
-    """What a log's files look like from outside, as one digest; and when the newest of them changed (Unix seconds)."""
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    stats = [(str(file.relative_to(path)), file.stat()) for file in files]
-    look = [[name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino] for name, stat in stats]
-    return digest(look), max((stat.st_mtime for _, stat in stats), default=0.0)
+def _file_stats(path: Path) -> tuple[str, float]:
+    """Names, sizes, times and inodes of a log's files as one digest; and when the newest of them changed (Unix seconds)."""
+    stats = [(name, file.stat()) for name, file in log_files(path).items()]
+    rows = [[name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino] for name, stat in stats]
+    return digest(rows), max((stat.st_mtime for _, stat in stats), default=0.0)

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 
 from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_image, is_wall_clock
-from vilp_data.decode.depth import is_depth, measured_depth
-from vilp_data.decode.video import VideoDecoder, is_video, video_codec
+from vilp_data.decode.depth import is_depth, is_grey16, measured_depth
+from vilp_data.decode.video import VideoDecoder
+from vilp_data.decode.video_packet import is_video, video_codec
 from vilp_data.errors import VilpDataError
 from vilp_data.sources import IndexedLog, open_log
+from vilp_data.sources.folder_hash import log_files
 from vilp_data.types import I64, Message, TopicInfo
 
-GLANCE = 20  # messages of a topic that are decoded
+SAMPLED = 20  # messages of a topic that are decoded
 FAR_APART_S = 1.0  # a header this far from the log time is worth a word
 SHOWN_METADATA = 60  # characters of a metadata value in the terminal
 RELATIVE = ("hdf5", "lerobot")  # formats that count time from the first demonstration's start
@@ -54,8 +56,9 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class LogSummary:
-    """A whole log. `sampled` names the figures that rest on a part of it only.
+    """A whole log. `sampled` names the figures that rest on a part of it only; `doubts` are sentences on what seems to be missing.
 
+    n_whole         how many of its episodes have all their files, where they are kept in files of their own; else None
     log_clock       "wall", "simulated" (starting before the year 2000), "relative" to the first demonstration's start, or "none"
                     for logs whose rows carry no time
     assumed_rate_hz the rate that stands in for time where rows carry none, so rates and durations follow from it; else None
@@ -65,6 +68,7 @@ class LogSummary:
     format: str
     size_bytes: int
     n_episodes: int
+    n_whole: int | None
     start_ns: int | None
     duration_s: float
     log_clock: str
@@ -72,6 +76,7 @@ class LogSummary:
     topics: tuple[TopicSummary, ...]
     metadata: dict[str, dict[str, str]]
     sampled: tuple[str, ...]
+    doubts: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, ready for JSON."""
@@ -92,6 +97,7 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
             format=log.format,
             size_bytes=_size(path),
             n_episodes=len(episodes),
+            n_whole=getattr(log, "n_whole", None),
             start_ns=start_ns,
             duration_s=duration_s,
             log_clock=_log_clock(log.format, start_ns, assumed_rate_hz),
@@ -99,17 +105,18 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
             topics=topics,
             metadata=log.metadata(),
             sampled=_sampled(complete, times, start_ns),
+            doubts=tuple(log.doubts()),
         )
 
 
 def _sampled(complete: bool, times: dict[str, I64], start_ns: int | None) -> tuple[str, ...]:
-    glance = f"image and header columns: the first {GLANCE} messages of each topic at most"
+    columns = f"image and header columns: the first {SAMPLED} messages of each topic at most"
     if complete or start_ns is None:
-        return (glance,)
+        return (columns,)
     covered_s = (
         max((int(values.max()) for values in times.values() if len(values)), default=start_ns) - start_ns
     ) / 1e9
-    return (f"rates and gaps: the first {covered_s:.0f} s", glance)
+    return (f"rates and gaps: the first {covered_s:.0f} s", columns)
 
 
 def _topic(log: IndexedLog, topic: TopicInfo, times: I64 | None) -> TopicSummary:
@@ -119,7 +126,7 @@ def _topic(log: IndexedLog, topic: TopicInfo, times: I64 | None) -> TopicSummary
         note = "no message index: rate not known without reading the log"
     if topic.message_count != 0:
         try:
-            messages = log.first_messages(topic.name, GLANCE)
+            messages = log.first_messages(topic.name, SAMPLED)
             clock, lag_s = _header_clock(messages)
             image = _image(messages)
         except VilpDataError as error:
@@ -157,7 +164,8 @@ def _image(messages: list[Message]) -> str | None:
         return _video(messages)
     if not is_image(first):
         return None
-    height, width = (measured_depth(first) if is_depth(first) else decode_image(first)).shape[:2]
+    numbers = is_depth(first) or is_grey16(first)
+    height, width = (measured_depth(first) if numbers else decode_image(first)).shape[:2]
     return f"{height}x{width} {image_encoding(first)}"
 
 
@@ -193,9 +201,7 @@ def _clock_kind(time_ns: int) -> str:
 
 
 def _size(path: Path) -> int:
-    return (
-        sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.is_dir() else path.stat().st_size
-    )
+    return sum(file.stat().st_size for file in log_files(path).values())
 
 
 # --- for the terminal -----------------------------------------------------------------------------------------------
@@ -203,10 +209,13 @@ def _size(path: Path) -> int:
 
 def format_summary(summary: LogSummary) -> str:
     """The summary as a table for the terminal, warnings about clocks below it."""
+    duration = f"{summary.duration_s:.2f} s"
     episodes = f"{summary.n_episodes} episode{'' if summary.n_episodes == 1 else 's'}"
+    if summary.n_whole not in (None, summary.n_episodes):
+        episodes, duration = f"{summary.n_whole} of {episodes} have all their files", f"{duration} listed"
     start = "" if summary.start_ns is None else f", from {summary.start_ns} ns ({CLOCKS[summary.log_clock]})"
     size = f"{summary.size_bytes / 1e6:.1f} MB"
-    lines = [f"{summary.path}: {summary.format}, {size}, {episodes}, {summary.duration_s:.2f} s{start}", ""]
+    lines = [f"{summary.path}: {summary.format}, {size}, {episodes}, {duration}{start}", ""]
     head = ("topic", "schema", "encoding", "messages", "rate Hz", "max gap s", "image", "header clock", "lag s")
     lines += _table([head, *(_row(topic) for topic in summary.topics)])
     lines += _section("Worth knowing", _warnings(summary))
@@ -244,7 +253,7 @@ def _section(title: str, lines: Iterable[str]) -> list[str]:
 
 
 def _warnings(summary: LogSummary) -> list[str]:
-    lines = []
+    lines = list(summary.doubts)
     if summary.log_clock == "simulated":
         lines.append("log time starts before the year 2000: simulated time, or a recorder whose clock was never set")
     if summary.assumed_rate_hz is not None:
@@ -266,8 +275,13 @@ def _warnings(summary: LogSummary) -> list[str]:
                 f"{topic.name}: header stamps are simulated time, log time is wall time; do not mix them in one task"
             )
         elif topic.header_lag_s is not None and abs(topic.header_lag_s) > FAR_APART_S:
-            lines.append(f"{topic.name}: header stamps lie {topic.header_lag_s:.1f} s before log time; another clock?")
+            lines.append(f"{topic.name}: {header_gap(topic.header_lag_s)}; another clock?")
     return lines
+
+
+def header_gap(lag_s: float) -> str:
+    """How far header stamps lie from log time, in words. `lag_s`: log time minus header stamp."""
+    return f"header stamps lie {abs(lag_s):.1f} s {'before' if lag_s >= 0 else 'after'} log time"
 
 
 def _metadata_lines(metadata: dict[str, dict[str, str]]) -> list[str]:

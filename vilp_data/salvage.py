@@ -8,19 +8,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import BinaryIO
 
-from vilp_data import limits
 from vilp_data.errors import LogError, UsageError
 from vilp_data.salvage_report import SalvageReport
 from vilp_data.shards import atomic_file
 from vilp_data.sources.db3_log import MAGIC as SQLITE_MAGIC
 from vilp_data.sources.db3_salvage import Db3Salvage
 from vilp_data.sources.file_bytes import FileBytes
-from vilp_data.sources.line_endings import is_converted, restored
+from vilp_data.sources.line_endings import is_converted, restore
 from vilp_data.sources.mcap_clean import CleanMcap
 from vilp_data.sources.mcap_plausible import next_run
 from vilp_data.sources.mcap_records import MAGIC
 from vilp_data.sources.mcap_salvage import McapSalvage
-from vilp_data.sources.rosbag1_file import MAGIC as BAG_MAGIC
+from vilp_data.sources.rosbag1_records import MAGIC as BAG_MAGIC
 from vilp_data.sources.rosbag1_records import bag_record
 from vilp_data.sources.rosbag1_salvage import Rosbag1Salvage
 
@@ -57,14 +56,11 @@ def salvage_log(log: Path, out: Path, *, force: bool = False, drop_suspicious: b
 
 def _unconverted(source: FileBytes, report: SalvageReport) -> FileBytes:
     """The log with its line endings as they were, in a file that has no name."""
-    if source.size > limits.RECORD_BYTES:
-        raise limits.exceeded("a log whose line endings were converted", "RECORD_BYTES", source.size, where=source.path)
-    data, report.repaired = restored(source.at(0, source.size))
+    copy = tempfile.TemporaryFile()  # noqa: SIM115 - the reader closes it
+    report.repaired = restore(source, copy)
     report.note(
         "a transfer converted the log's line endings: copy it again in binary mode if the original still exists"
     )
-    copy = tempfile.TemporaryFile()  # noqa: SIM115 - the reader closes it
-    copy.write(data)
     return FileBytes(source.path, stream=copy)
 
 

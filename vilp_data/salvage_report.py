@@ -85,6 +85,13 @@ class SalvageReport:
             begin = self.skipped.pop().begin
         self.skipped.append(Skipped(begin, end, what))
 
+    def lose(self, begin: int, end: int, what: str, *, messages: bool = True) -> None:
+        """Bytes that gave nothing, and may have held messages (or else `messages` is False): behind the log's end there are none."""
+        self.skip(begin, end, what)
+        if messages and not self.ended:
+            self.amount_known = False
+            self.doubt("bytes are missing or unreadable where the log keeps its messages")
+
     def doubt(self, text: str) -> None:
         if text not in self.doubts:
             self.doubts.append(text)

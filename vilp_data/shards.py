@@ -7,12 +7,10 @@ that is there is complete: its own header is the commit. Bytes depend on content
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
 import struct
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from vilp_data.errors import BusyError, StoreError
+from vilp_data.errors import StoreError
 from vilp_data.keys import byte_blocks
 
 # Names of the safetensors format for the dtypes stored here.
@@ -33,7 +31,6 @@ _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 _ALIGNMENT = 64
 _MAX_HEADER_BYTES = 16 * 1024 * 1024
 _CHECKSUM = "sha256"
-_LEFTOVER_AGE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,53 +167,6 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
             found=error.strerror,
             remedy="free some space, or check the folder's permissions; nothing was replaced",
         ) from error
-
-
-@contextlib.contextmanager
-def writer_lock(root: Path) -> Iterator[None]:
-    """Be the only writer of the dataset at `root` for the length of the block, once what a killed writer had committed is finished and
-    what it left besides is cleared away.
-
-    Raises BusyError at once where another process is writing."""
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(root / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise StoreError(
-            "the dataset folder cannot be written",
-            where=root,
-            found=error.strerror,
-            remedy="check its permissions, or choose another folder",
-        ) from error
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BusyError(
-                "another process is writing this dataset", where=root, remedy="wait until it is done, or stop it"
-            ) from error
-        from vilp_data.surgery import journal  # which is made of this module
-
-        _remove_leftovers(root)
-        journal.settle(root)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _remove_leftovers(root: Path) -> None:
-    for folder in ("", "episodes", "latents", "action_sets", "history"):
-        for leftover in _temporary_files(root, folder):
-            leftover.unlink(missing_ok=True)
-    # Recorders and trainers write here without this lock: only what is surely nobody's goes.
-    for folder in ("logs", "runs"):
-        for leftover in _temporary_files(root, folder):
-            if time.time() - leftover.stat().st_mtime > _LEFTOVER_AGE_S:
-                leftover.unlink(missing_ok=True)
-
-
-def _temporary_files(root: Path, folder: str) -> list[Path]:
-    return list((root / folder).glob("**/.*.tmp" if folder else ".*.tmp"))
 
 
 def sync_folder(folder: Path) -> None:

@@ -96,7 +96,7 @@ class ViewSpec(TopicSpec):
         return 3 if self.depth is None else 1
 
 
-class FramesSpec(Frozen):
+class TransformSpec(Frozen):
     """For topics of transforms (tf): the vector is where `to_frame` lies in `from_frame`, translation x y z and unit quaternion x y z w
     of continuous sign, resolved through the tree of frames. Transforms of the topic with `_static` after its name hold always.
     """
@@ -119,7 +119,7 @@ class FramesSpec(Frozen):
         return {name: value for name, value in plain(self).items() if name not in unstated}
 
 
-class VectorSpec(TopicSpec, FramesSpec):
+class VectorSpec(TopicSpec, TransformSpec):
     """A vector read from a topic's messages.
 
     fields  paths into the message, concatenated: "pose.position.x", "position[0:7]", "pose" (its seven numbers), "[0:2]" for a
@@ -138,7 +138,7 @@ class VectorSpec(TopicSpec, FramesSpec):
         return self
 
 
-class ActionSpec(FramesSpec):
+class ActionSpec(TransformSpec):
     """One part of the action vector: a command topic, or a state some steps ahead for logs that recorded no commands.
 
     kind "absolute": the last command issued in [t_k, t_{k+1}), else the one still held (grippers too)

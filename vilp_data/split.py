@@ -31,6 +31,7 @@ __all__ = [
     "assignment_hash",
     "check_split",
     "draw_split",
+    "leaks",
 ]
 
 NEAR_LIMIT = 1000  # pairs reported at most: a scene that hardly moves would otherwise fill the lock
@@ -126,7 +127,7 @@ def check_split(lock: SplitLock, episodes: Sequence[SplitEpisode]) -> list[str]:
     vanished = sorted(set(lock.assignment) - present)
     if vanished:
         findings.append(f"{_listed(vanished)} in the lock but not in the dataset: kept, to return to the same side")
-    findings += _leaks(lock, episodes)
+    findings += leaks(lock, episodes)
     findings += _drift(lock, [episode for episode in episodes if episode.id in lock.assignment])
     return findings
 
@@ -326,7 +327,7 @@ def _near_duplicates(episodes: Sequence[SplitEpisode], assignment: Mapping[str, 
     return tuple(different[:NEAR_LIMIT])
 
 
-def _leaks(lock: SplitLock, episodes: Sequence[SplitEpisode]) -> list[str]:
+def leaks(lock: SplitLock, episodes: Sequence[SplitEpisode]) -> list[str]:
     """Groups and contents on both sides, among the episodes at hand and those the lock remembers."""
     groups = dict(lock.groups) | {episode.id: _label(episode) for episode in episodes}
     contents = dict(lock.contents) | {episode.id: episode.content_hash for episode in episodes}

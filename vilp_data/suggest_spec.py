@@ -7,27 +7,21 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from vilp_data.errors import LogError
-from vilp_data.log_summary import GLANCE, LogSummary, TopicSummary, summarise
+from vilp_data.errors import LogError, some_of
+from vilp_data.log_roles import LogRoles, roles_in
+from vilp_data.log_summary import header_gap
 from vilp_data.model_size import common_size, cut_share
-from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import parse_task
-from vilp_data.topic_roles import TopicRole, role_of, words_of
-from vilp_data.transforms import links_of
-from vilp_data.types import F64, I64, Message
+from vilp_data.topic_roles import Picture, TopicRole, words_of
 
 ONE_CLOCK_S = 1.0
 """Header stamps this near log time may stand beside topics that are read by log time."""
 
 LONGEST_LIST = 16  # topics of no use that are named
 FASTEST_HZ = 30.0  # for a task without cameras
-PAUSE_S, PAUSE_PERIODS = 2.0, 20
 SLOW_HZ = 5.0  # below it the usual stale_after_s would mask half of the steps
 CAMERA_WORDS = {
     *(
@@ -49,31 +43,11 @@ CAMERA_WORDS = {
 }
 """Words of a camera topic that do not tell one camera from another."""
 
-TOOL_WORDS = ("tool", "tcp", "ee", "gripper", "hand", "flange", "wrist")
-
-
-@dataclass(frozen=True)
-class _Look:
-    """What was found in a log."""
-
-    summary: LogSummary
-    cameras: list[TopicRole]
-    doubles: dict[str, str]
-    states: list[TopicRole]
-    commands: list[TopicRole]
-    others: list[TopicRole]
-    frames: list[TopicRole]
-    unused: list[TopicRole]
-    pause_s: float | None
-
-    def table(self, topic: str) -> TopicSummary:
-        return next(found for found in self.summary.topics if found.name == topic)
-
 
 def suggest_spec(path: Path, *, name: str | None = None) -> str:
     """The text of a task TOML for the log at `path`. Raises what `open_log` raises, and LogError where nothing in the log could be
     read by a task."""
-    look = _look(path)
+    look = roles_in(path)
     if not look.cameras and not look.states and not look.others:
         found = "; ".join(f"{role.topic}: {role.why}" for role in look.unused[:3]) or "no messages"
         raise LogError(
@@ -94,98 +68,9 @@ def suggest_spec(path: Path, *, name: str | None = None) -> str:
         *_view_lines(look, clocks, names),
         *_unused_lines(look),
     ]
-    text = "\n".join(lines).rstrip("\n") + "\n"
+    text = "\n".join(_printable(line) for line in lines).rstrip("\n") + "\n"
     parse_task(text, where=f"the task suggested for {path}")
     return text
-
-
-# --- looking ------------------------------------------------------------------------------------------------------------
-
-
-def _look(path: Path) -> _Look:
-    summary = summarise(path)
-    with open_log(path) as log:
-        roles = [_role(log, topic) for topic in summary.topics if topic.n_messages != 0]
-        doubles = _doubles([role for role in roles if role.kind == "camera"])
-        cameras = [role for role in roles if role.kind == "camera" and role.topic not in doubles]
-        states = [role for role in roles if role.kind == "state"]
-        others = [role for role in roles if role.kind == "other"]
-        if not cameras and not states and others:
-            states, others = others[:1], others[1:]
-        times, complete = log.message_times()
-        pause_s = (
-            _pause_s([times[role.topic] for role in (*cameras, *states) if role.topic in times]) if complete else None
-        )
-    return _Look(
-        summary, cameras, doubles, states, [role for role in roles if role.kind == "command"], others,
-        [role for role in roles if role.kind == "frames" and not role.topic.endswith("_static")],
-        [role for role in roles if role.kind == "unused"], pause_s if summary.n_episodes == 1 else None,
-    )  # fmt: skip
-
-
-def _role(log: IndexedLog, topic: TopicSummary) -> TopicRole:
-    try:
-        messages = log.first_messages(topic.name, GLANCE)
-    except LogError as error:
-        return TopicRole(topic.name, "unused", f"{error.what}: {error.found}" if error.found else error.what)
-    if not messages:
-        return TopicRole(topic.name, "unused", "its first messages cannot be found")
-    role = role_of(topic.name, messages)
-    if role.kind == "camera" and topic.rate_hz is None:
-        return TopicRole(topic.name, "unused", f"{role.why}, but one message only")
-    if role.kind == "frames" and role.frames and not topic.name.endswith("_static"):
-        pair, frames = _frame_pair(log, topic.name, messages)
-        return replace(role, why=pair, frames=frames)
-    return role
-
-
-def _frame_pair(log: IndexedLog, topic: str, messages: Sequence[Message]) -> tuple[str, tuple[str, ...]]:
-    """ "from -> to": the root of the tree, and of the frames without a child the one that is called like a tool, else the lowest; and
-    every frame there is."""
-    links = [link for message in messages for link in links_of(message, clock="log")]
-    if any(known.name == f"{topic}_static" and known.message_count != 0 for known in log.topics()):
-        links += [
-            link for message in log.first_messages(f"{topic}_static", GLANCE) for link in links_of(message, clock="log")
-        ]
-    parent = {link.child: link.parent for link in links}
-    leaves = sorted(set(parent) - set(parent.values())) or sorted(parent)
-
-    def above(frame: str) -> list[str]:
-        chain = [frame]
-        while chain[-1] in parent and parent[chain[-1]] not in chain:
-            chain.append(parent[chain[-1]])
-        return chain
-
-    def is_tool(frame: str) -> bool:
-        return any(word.rstrip("0123456789") in TOOL_WORDS for word in words_of(frame))
-
-    leaf = max(leaves, key=lambda frame: (is_tool(frame), len(above(frame)), frame))
-    frames = {name for link in links for name in (link.parent, link.child)}
-    return f"{above(leaf)[-1]} -> {leaf}", tuple(sorted(frames))
-
-
-def _doubles(cameras: Sequence[TopicRole]) -> dict[str, str]:
-    """Topics that show what another one shows too (raw beside compressed), and which: the compressed one is smaller to read."""
-    groups: dict[str, list[TopicRole]] = {}
-    for role in cameras:
-        base = re.sub(r"/(compressed|image_raw|image_rect_color|image_color|image|h264|theora|ffmpeg)$", "", role.topic)
-        base = re.sub(r"/(image_raw|image_rect_color|image_color|image)$", "", base)
-        groups.setdefault(f"{base} {role.picture.depth_unit if role.picture else None}", []).append(role)
-    doubles = {}
-    for roles in groups.values():
-        best = max(roles, key=lambda role: (role.topic.endswith("/compressed"), role.topic))
-        doubles.update({role.topic: best.topic for role in roles if role is not best})
-    return doubles
-
-
-def _pause_s(times: Sequence[I64]) -> float | None:
-    """A silence on all topics at once that parts demonstrations: well above the usual interval; None where there is none."""
-    if not times or sum(map(len, times)) < 3:
-        return None
-    stamps = np.unique(np.concatenate(times))
-    gaps_s: F64 = np.diff(stamps) / 1e9
-    pauses = gaps_s[gaps_s > max(PAUSE_S, PAUSE_PERIODS * float(np.median(gaps_s)))] if len(gaps_s) else gaps_s
-    return float(f"{pauses.min() / 2:.2g}") if len(pauses) else None
 
 
 # --- writing ------------------------------------------------------------------------------------------------------------
@@ -226,13 +111,18 @@ def _view_name(topic: str) -> str:
     )
 
 
+def _printable(line: str) -> str:
+    """A line of the file that stays one, whatever a log calls its topics."""
+    return "".join(c if c.isprintable() else "?" for c in line)
+
+
 def _toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _clocks(look: _Look) -> dict[str, tuple[str, str]]:
+def _clocks(look: LogRoles) -> dict[str, tuple[str, str]]:
     """Topic -> its clock and the reason. Headers are better (the recorder's delay is not in them), but one task has one time."""
-    roles = [*look.cameras, *look.states, *look.commands, *look.others, *look.frames]
+    roles = [*look.cameras, *look.states, *look.commands, *look.others, *look.transforms]
     lags = [role.header_lag_s for role in (*look.cameras, *look.states, *look.commands)]
     known = [lag for lag in lags if lag is not None]
     agree = bool(known) and len(known) == len(lags) and max(known) - min(known) <= ONE_CLOCK_S
@@ -245,12 +135,12 @@ def _clocks(look: _Look) -> dict[str, tuple[str, str]]:
         else:
             clocks[role.topic] = (
                 "log",
-                f"header stamps lie {role.header_lag_s:.1f} s before log time, and not every topic has them",
+                f"{header_gap(role.header_lag_s)}, and not every topic has them",
             )
     return clocks
 
 
-def _rate_line(look: _Look) -> str:
+def _rate_line(look: LogRoles) -> str:
     summary = look.summary
     if summary.assumed_rate_hz is not None:
         return f"rate_hz = {summary.assumed_rate_hz:g}  # rows carry no time in this format: write the rate at which they were recorded"
@@ -275,7 +165,12 @@ def _round(rate_hz: float) -> float:
 
 
 def _entry(
-    look: _Look, role: TopicRole, clocks: dict[str, tuple[str, str]], group: Sequence[str] = (), *, held: bool = False
+    look: LogRoles,
+    role: TopicRole,
+    clocks: dict[str, tuple[str, str]],
+    group: Sequence[str] = (),
+    *,
+    held: bool = False,
 ) -> str:
     """The inline table of a vector. `held`: a command, which grows no staler."""
     items = {"topic": role.topic, "clock": clocks[role.topic][0]}
@@ -295,7 +190,7 @@ def _why(role: TopicRole, clocks: dict[str, tuple[str, str]]) -> str:
     return role.why + (f"; {clock}" if clock else "")
 
 
-def _low_dim_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names) -> tuple[list[str], list[str]]:
+def _low_dim_lines(look: LogRoles, clocks: dict[str, tuple[str, str]], names: _Names) -> tuple[list[str], list[str]]:
     """The lines, and the names of the parts that are not commented out."""
     lines, given = [], []
     for role in (*look.states, *look.others[:LONGEST_LIST]):
@@ -304,11 +199,13 @@ def _low_dim_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Name
             part = names.new(_part_name(role.topic))
             lines.append(f"{hidden}low_dim.{part} = {_entry(look, role, clocks, group)}  # {_why(role, clocks)}")
             given += [] if hidden else [part]
-    for role in look.frames[:LONGEST_LIST]:
-        base, tool = role.why.split(" -> ")
+    for role in look.transforms[:LONGEST_LIST]:
+        if role.from_to is None:
+            continue
+        base, tool = role.from_to
         clock = "" if clocks[role.topic][0] == "header" else ', clock = "log"'
         pair = f"from_frame = {_toml(base)}, to_frame = {_toml(tool)}"
-        shown = ", ".join(role.frames[:LONGEST_LIST]) + (", …" if len(role.frames) > LONGEST_LIST else "")
+        shown = some_of(role.reference_frames, LONGEST_LIST)
         lines.append(
             f"# low_dim.{names.new(_plain(tool))} = {{ topic = {_toml(role.topic)}{clock}, {pair} }}  # frames: {shown}"
         )
@@ -316,7 +213,7 @@ def _low_dim_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Name
     return ([head, *lines, ""] if lines else []), given
 
 
-def _action_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names, parts: Sequence[str]) -> list[str]:
+def _action_lines(look: LogRoles, clocks: dict[str, tuple[str, str]], names: _Names, parts: Sequence[str]) -> list[str]:
     sure = len(look.commands) == 1
     lines = []
     for role in look.commands:
@@ -340,9 +237,11 @@ def _action_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names
     return [f"# What the robot was told to do. {head}", *lines, ""]
 
 
-def _episodes_lines(look: _Look) -> list[str]:
-    if look.summary.n_episodes > 1:
-        return [f"# The log's own {look.summary.n_episodes} demonstrations are taken as they are.", ""]
+def _episodes_lines(look: LogRoles) -> list[str]:
+    if (count := look.summary.n_episodes) > 1:
+        n_whole = look.summary.n_whole
+        whole = "" if n_whole in (None, count) else f"; the files of {n_whole} of them are all there"
+        return [f"# The log's own {count} demonstrations are taken as they are{whole}.", ""]
     lines = []
     if look.pause_s is not None:
         lines.append(
@@ -362,7 +261,7 @@ def _episodes_lines(look: _Look) -> list[str]:
     ]
 
 
-def _view_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names) -> list[str]:
+def _view_lines(look: LogRoles, clocks: dict[str, tuple[str, str]], names: _Names) -> list[str]:
     pictures = [(role, role.picture) for role in look.cameras if role.picture is not None]
     if not pictures:
         return []
@@ -374,21 +273,35 @@ def _view_lines(look: _Look, clocks: dict[str, tuple[str, str]], names: _Names) 
         lines += [f"[views.{names.new(_view_name(role.topic))}]", f"topic = {_toml(role.topic)}  # {role.why}"]
         lines += [f"height = {size.height}", f"width = {size.width}"]
         lines += [f'fit = "crop"  # {cut:.0%} of the picture lies outside; "pad" keeps all of it'] if cut else []
-        lines += [f'clock = "{clock}"' + (f"  # {reason}" if reason else "")] if clock != "header" else []
+        if clock != "header" and picture.reordered and role.header_lag_s is not None:
+            lines.append(f"offset_s = {role.header_lag_s:.3f}  # {reason}, and by log time B frames are out of order")
+        elif clock != "header":
+            lines.append(f'clock = "{clock}"' + (f"  # {reason}" if reason else ""))
         if (rate_hz := look.table(role.topic).rate_hz) is not None and rate_hz < SLOW_HZ:
             lines.append(f"stale_after_s = {float(f'{2.5 / rate_hz:.2g}'):g}  # {rate_hz:.2g} images a second")
-        if picture.depth_unit is not None:
-            near, far = (number * (1e-3 if picture.depth_unit == "mm" else 1.0) for number in picture.near_far)
-            near, far = float(f"{near:.2g}"), float(f"{far:.2g}")
-            far = far if far > near else near + 1.0
-            lines.append(
-                f'depth = {{ unit = "{picture.depth_unit}", near_m = {near:g}, far_m = {far:g} }}  # the range of the first image'
-            )
-        lines.append("")
+        lines += [*_number_lines(role.topic, picture), ""]
     return lines
 
 
-def _unused_lines(look: _Look) -> list[str]:
+def _number_lines(topic: str, picture: Picture) -> list[str]:
+    """What the numbers of a camera without colours mean; of grey of 16 bits, which may be either, both lines, one commented out."""
+    if picture.depth_unit is None:
+        return []
+    near, far = (number * (1e-3 if picture.depth_unit == "mm" else 1.0) for number in picture.near_far)
+    near, far = float(f"{near:.2g}"), float(f"{far:.2g}")
+    far = far if far > near else near + 1.0
+    depth = f'depth = {{ unit = "{picture.depth_unit}", near_m = {near:g}, far_m = {far:g} }}  # the range of the first image'
+    if not picture.grey16:
+        return [depth]
+    black = min(round(picture.near_far[0]), 65534)
+    white = max(round(picture.near_far[1]), black + 1)
+    levels = f"levels = [{black}, {white}]  # what becomes black and white: the range of the first image"
+    if "depth" in words_of(topic):
+        return [depth, f"# {levels}; instead of depth, if this is a picture"]
+    return [levels, f"# {depth}; instead of levels, if this measures distance"]
+
+
+def _unused_lines(look: LogRoles) -> list[str]:
     left = [*((topic, f"shows what {other} shows") for topic, other in look.doubles.items())]
     left += [(role.topic, role.why) for role in look.unused]
     left += [(role.topic, role.why) for role in look.others[LONGEST_LIST:]]

@@ -9,16 +9,17 @@ from typing import Literal
 import numpy as np
 
 from vilp_data.decode import decode_image, decode_vector, header_time_ns, image_encoding, is_image
-from vilp_data.decode.depth import is_depth, measured_depth
+from vilp_data.decode.depth import is_depth, is_grey16, measured_depth
 from vilp_data.decode.numeric_fields import numeric_paths
 from vilp_data.decode.usual_fields import usual_fields
 from vilp_data.decode.vectors import published_names
-from vilp_data.decode.video import VideoDecoder, is_video, video_codec
+from vilp_data.decode.video import VideoDecoder
+from vilp_data.decode.video_packet import is_video, video_codec
 from vilp_data.errors import VilpDataError
 from vilp_data.transforms import links_of
 from vilp_data.types import Message
 
-Kind = Literal["camera", "state", "command", "other", "frames", "unused"]
+Kind = Literal["camera", "state", "command", "other", "transforms", "unused"]
 
 COMMAND_WORDS = {
     *(
@@ -79,13 +80,17 @@ JUMP_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Picture:
-    """A camera's images. `depth_unit`: of one that surely measures distance, with the range of its first image in that unit."""
+    """A camera's images. `depth_unit`: of one that measures distance, with the range of its first image in that unit. `grey16`: of one
+    that may as well be a picture, so that the unit and the range are those of its numbers if it is none. `reordered`: video with
+    B frames."""
 
     height: int
     width: int
     encoding: str
     depth_unit: str | None = None
     near_far: tuple[float, float] = (0.0, 0.0)
+    grey16: bool = False
+    reordered: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ class TopicRole:
     stamped        its messages carry stamps of their own
     header_lag_s   log time minus header stamp; None where the stamps cannot be used
     name_groups    joints by publisher, where several share the topic
-    frames         of transforms: the frames that its first messages name
+    reference_frames  of transforms: those that its first messages name; from_to: two of them that a robot is likely to be about
     """
 
     topic: str
@@ -108,7 +113,8 @@ class TopicRole:
     stamped: bool = False
     header_lag_s: float | None = None
     marks: bool = False
-    frames: tuple[str, ...] = ()
+    reference_frames: tuple[str, ...] = ()
+    from_to: tuple[str, str] | None = None
 
 
 def role_of(topic: str, messages: list[Message]) -> TopicRole:
@@ -120,8 +126,9 @@ def role_of(topic: str, messages: list[Message]) -> TopicRole:
             links = [link for message in messages for link in links_of(message, clock="log")]
             frames = tuple(sorted({name for link in links for name in (link.parent, link.child)}))
             return TopicRole(
-                topic, "frames", "transforms", stamped=True, header_lag_s=_tf_lag_s(messages), frames=frames
-            )
+                topic, "transforms", "transforms", stamped=True, header_lag_s=_tf_lag_s(messages),
+                reference_frames=frames,
+            )  # fmt: skip
         if is_image(first) or is_video(first) or is_depth(first):
             picture = _picture(messages)
             why = f"{picture.height}x{picture.width} {picture.encoding}"
@@ -139,21 +146,30 @@ def words_of(topic: str) -> list[str]:
 
 def _picture(messages: list[Message]) -> Picture:
     first = messages[0]
-    if is_depth(first):
+    if not is_video(first) and (is_depth(first) or is_grey16(first)):
         numbers = measured_depth(first)
         read = numbers[np.isfinite(numbers) & (numbers > 0)].astype(np.float64)
         near, far = np.quantile(read, [0.02, 0.98]).tolist() if len(read) else (0.0, 0.0)
         unit = "m" if numbers.dtype.kind == "f" else "mm"
         height, width = numbers.shape[:2]
-        return Picture(height, width, image_encoding(first), unit, (near, far))
+        return Picture(height, width, image_encoding(first), unit, (near, far), grey16=not is_depth(first))
     if is_video(first):
-        decoder = VideoDecoder()
-        for number, message in enumerate(messages):
-            for _, frame in decoder.feed(number, message):
-                return Picture(frame.height, frame.width, video_codec(first))
-        raise next(iter(decoder.lost.values()), VilpDataError("no picture in its first packets", where=first.topic))
+        return _video_picture(messages)
     height, width, _ = decode_image(first).shape
     return Picture(height, width, image_encoding(first))
+
+
+def _video_picture(messages: list[Message]) -> Picture:
+    decoder, codec = VideoDecoder(), video_codec(messages[0])
+    fed = [decoder.feed(number, message) for number, message in enumerate(messages)]
+    shown = [(number, frame.height, frame.width) for frames in (*fed, decoder.rest()) for number, frame in frames]
+    if not shown:
+        raise next(
+            iter(decoder.lost.values()), VilpDataError("no picture in its first packets", where=messages[0].topic)
+        )
+    numbers = [number for number, _, _ in shown]
+    _, height, width = shown[0]
+    return Picture(height, width, codec, reordered=numbers != sorted(numbers))
 
 
 def _vector_role(topic: str, messages: list[Message]) -> TopicRole:

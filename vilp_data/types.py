@@ -23,6 +23,9 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
+RATE_TOLERANCE = 0.02
+"""How far the rate of an episode may lie from the others' where the spec states none: cameras are not exact."""
+
 Clock = Literal["header", "log", "publish"]
 Outcome = Literal["success", "failure", "unknown"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,12 +18,15 @@ import numpy as np
 
 from vilp_data import align, geometry
 from vilp_data.decode import depth as decode_depth
-from vilp_data.decode import video as decode_video
-from vilp_data.decode.images import decode_image
+from vilp_data.decode.images import decode_image, range_of_one
+from vilp_data.decode.video import BEFORE_KEYFRAME
+from vilp_data.decode.video_packet import holds_picture, is_video
 from vilp_data.errors import DecodeError, SpecError, UsageError
 from vilp_data.frame_spool import FrameSpool
 from vilp_data.spec import ViewSpec
 from vilp_data.types import F32, I32, I64, U8, Bool, Message
+from vilp_data.video_images import VideoImages
+from vilp_data.video_start import VideoStart
 
 DAMAGED_SHARE = 0.5
 """More damaged images than this among those that steps use, and the episode is refused: that is no glitch."""
@@ -31,8 +34,14 @@ DAMAGED_SHARE = 0.5
 HOPELESS = 20
 """So many damaged images before the first whole one end the reading: the topic holds something else."""
 
+HOPELESS_S = 600
+"""So long without a keyframe, and a video's reading ends: cameras send one every second or so, a recording's first may be late."""
+
 PASSED_BY = 4
 """Images that no step asked for are kept, so many, until a later one is known to be whole."""
+
+UNREAD, DAMAGED = -1, -2
+"""In place of an image's row among the frames."""
 
 
 @dataclass
@@ -93,102 +102,107 @@ class ViewFrames:
 
     def __init__(self, view: str, spec: ViewSpec, ticks: Ticks, *, scratch: Path | None = None) -> None:
         self.view, self.spec, self.ticks = view, spec, ticks
-        self._stamps = array("q")
-        self._spool, self._rows = FrameSpool(scratch), dict[int, int]()
-        self._damaged: dict[int, DecodeError] = {}
+        self._stamps, self._rows = array("q"), array("q")  # of each image, as its message came
+        self._spool = FrameSpool(scratch)
+        self._first_damage: DecodeError | None = None
+        self._n_damaged = self._n_early = 0
         self._latest: _Arrived | None = None
         self._passed_by: deque[_Arrived] = deque(maxlen=PASSED_BY)
-        self._video: bool | None = None  # told by the first message: asking each would cost as much as reading it
-        self._decoder: decode_video.VideoDecoder | None = None
-        self._rgb: decode_video.RgbReader | None = None
+        self._floats = False
+        self._video: VideoImages | None = None
 
-    def warm_up(self, packets: list[Message]) -> None:
-        """Feed a video's packets of before the demonstration, from a keyframe on: its first frames need them."""
-        if not packets:
-            return
-        self._decoder = decode_video.VideoDecoder()
-        for number, message in enumerate(packets, start=-len(packets)):
-            for _ in self._decoder.feed(number, message):
-                pass
+    def warm_up(self, start: VideoStart | None) -> None:
+        """Give a video what its decoder must have had before the demonstration: its first frames need it."""
+        if start is not None:
+            self._video = VideoImages(self.spec, self._stamps, start)
 
     def add(self, message: Message, stamp_ns: int) -> None:
-        """Raises DecodeError once nothing but damaged images came."""
-        number = len(self._stamps)
-        self._stamps.append(stamp_ns)
-        self.ticks.saw(self.view, stamp_ns)
-        if self._video is None:
-            self._video = decode_video.is_video(message)
-        if self._video:
-            self._decoder = self._decoder or decode_video.VideoDecoder()
-            self._take_video(self._decoder.feed(number, message))
-        else:
-            self._arrive(_Arrived(number, stamp_ns, partial(stored_image, message, self.spec)))
-        if len(self._damaged) > HOPELESS and not self._rows:
-            raise next(iter(self._damaged.values()))
+        """Raises DecodeError once nothing but damaged images came, SpecError where the view's table is of another kind of camera."""
+        if (
+            not self._stamps and self._video is None
+        ):  # told by the first message: asking each would cost as much as reading it
+            self._floats = message.schema == "array" and np.asarray(message.body).dtype.kind == "f"
+            if is_video(message):
+                self.warm_up(VideoStart({}, ()))
+        if self._video is not None:
+            if holds_picture(message):
+                self._counted(stamp_ns)
+            self._take(self._video, self._video.feed(message))
+            return
+        self._arrive(_Arrived(self._counted(stamp_ns), stamp_ns, partial(stored_image, message, self.spec)))
 
     @property
     def stamps_ns(self) -> I64:
-        """int64 [M], as the messages came."""
+        """int64 [M] of its images, as the messages came. A video's messages without a picture are none."""
         return np.array(self._stamps, np.int64)
 
     def observe(self, ticks_ns: I64) -> Seen:
         """What the view shows at each tick. A damaged image is one that never came: the step sees the one before it.
 
-        Raises DecodeError where more than DAMAGED_SHARE of the images that steps would see are damaged."""
+        Raises DecodeError where more than DAMAGED_SHARE of the images that steps would see are damaged, and AlignError where a
+        video's frames are not in the order of their stamps."""
         self._end(ticks_ns)
-        stamps = self.stamps_ns
+        stamps, rows = self.stamps_ns, np.array(self._rows, np.int64)
         order = align.order_of(stamps, topic=self.spec.topic)
-        wanted = order[np.unique(_used(stamps[order], ticks_ns, self.spec))]
-        bad = [number for number in wanted.tolist() if number in self._damaged]
-        if len(bad) > DAMAGED_SHARE * len(wanted):
-            raise self._damaged[bad[0]]
-        kept = order
-        while True:
-            kept = kept[[int(number) in self._rows for number in kept]] if len(bad) else kept
-            observed = align.observe(stamps[kept], ticks_ns, stale_after_s=self.spec.stale_after_s)
-            used, source_index = np.unique(np.maximum(observed.index, 0), return_inverse=True)
-            bad = [int(number) for number in kept[used] if int(number) not in self._rows]
-            if not bad:
-                break
-        rows = np.array([self._rows[int(number)] for number in kept[used]], np.int64)
-        early = sum(error.found == decode_video.BEFORE_KEYFRAME for error in self._damaged.values())
+        wanted = order[np.unique(np.maximum(self._seen_at(stamps[order], ticks_ns).index, 0))]
+        self._refuse_damaged(int(np.count_nonzero(rows[wanted] == DAMAGED)), len(wanted))
+        whole = order[rows[order] >= 0]
+        observed = self._seen_at(stamps[whole], ticks_ns)
+        used, source_index = np.unique(np.maximum(observed.index, 0), return_inverse=True)
+        frames = self._spool.take(rows[whole[used]])
+        if self._floats and frames.any() and frames.max() <= 1:
+            raise range_of_one(self.spec.topic, f"nothing above 1 in {len(frames)} images")
         index = source_index.astype(np.int32)
-        return Seen(self._spool.take(rows), index, observed.valid, observed.age_s, len(self._damaged), early)
+        return Seen(frames, index, observed.valid, observed.age_s, self._n_damaged, self._n_early)
+
+    def _seen_at(self, stamps_ns: I64, ticks_ns: I64) -> align.Observed:
+        return align.observe(stamps_ns, ticks_ns, stale_after_s=self.spec.stale_after_s)
 
     def _end(self, ticks_ns: I64) -> None:
-        if self._decoder is not None:
-            self._take_video(self._decoder.rest())
-            for number in self._decoder.smeared():
-                self._rows.pop(number, None)
-            self._damaged |= {number: error for number, error in self._decoder.lost.items() if number >= 0}
+        if self._video is not None:
+            self._take(self._video, self._video.end())
         if self._latest is not None:
             self._decide(self._latest, int(ticks_ns[-1]) + 2 * align.TOLERANCE_NS)
             self._latest = None
 
+    def _refuse_damaged(self, damaged: int, wanted: int) -> None:
+        first = self._first_damage
+        if first is not None and damaged > DAMAGED_SHARE * wanted:
+            found = f"{damaged} of {wanted}; the first, {first.where}: {first.what}, {first.found}"
+            what = "too many of the images that steps would see are damaged"
+            raise DecodeError(what, where=f"view {self.view}", found=found, remedy=first.remedy)
+
     # --- one image
 
-    def _take_video(self, frames: decode_video.Frames) -> None:
-        for number, frame in frames:
-            if number >= 0:
-                self._arrive(_Arrived(number, self._stamps[number], partial(self._stored_frame, frame)))
+    def _counted(self, stamp_ns: int) -> int:
+        """The number of an image that is there now."""
+        self._stamps.append(stamp_ns)
+        self._rows.append(UNREAD)
+        self.ticks.saw(self.view, stamp_ns)
+        return len(self._stamps) - 1
+
+    def _take(self, video: VideoImages, images: Iterable[tuple[int, Callable[[], U8]]]) -> None:
+        for number, rgb in images:
+            self._arrive(_Arrived(number, self._stamps[number], partial(_fitted_rgb, rgb, self.spec)))
+        for number, error in video.losses():
+            self._note_damage(number, error)
 
     def _arrive(self, image: _Arrived) -> None:
-        """The latest image by its stamp waits for the next one; one that comes late is decided at once."""
+        """The latest image by its stamp waits for the next one: a step may fall between the two. One that comes late is decoded at
+        once, for the interval that it cuts in two was decided already."""
         if self._latest is not None and image.stamp_ns < self._latest.stamp_ns:
-            self._decide(image, self._latest.stamp_ns)
+            self._decode(image)
             return
         before, self._latest = self._latest, image
         if before is not None:
             self._decide(before, image.stamp_ns)
 
     def _decide(self, image: _Arrived, until_ns: int) -> None:
-        """Decode an image if a step may see it; where it is damaged, one before it that nobody had asked for."""
+        """Decode an image if a step may see it; where it is damaged, the one before it, which nobody had asked for."""
         if not self.ticks.may_fall_in(image.stamp_ns, until_ns):
             self._passed_by.append(image)
             return
-        while not self._decode(image):
-            if not self._passed_by:
-                return
+        while not self._decode(image) and self._passed_by:
             image = self._passed_by.pop()
         self._passed_by.clear()
 
@@ -196,22 +210,24 @@ class ViewFrames:
         try:
             self._rows[image.number] = self._spool.append(image.decode())
         except DecodeError as error:
-            self._damaged[image.number] = error
+            self._note_damage(image.number, error)
             return False
         return True
 
-    def _stored_frame(self, frame: decode_video.Frame) -> U8:
-        if self.spec.depth is not None or self.spec.levels is not None:
-            remedy = "take `depth` or `levels` out of the view's table"
-            raise DecodeError("compressed video holds no depth", where=self.spec.topic, remedy=remedy)
-        self._rgb = self._rgb or decode_video.RgbReader()
-        return _fitted(self._rgb.rgb(frame), self.spec)
+    def _note_damage(self, number: int, error: DecodeError) -> None:
+        self._rows[number] = DAMAGED
+        self._first_damage = self._first_damage or error
+        self._n_damaged += 1
+        self._n_early += error.found == BEFORE_KEYFRAME
+        waited_s = abs(self._stamps[number] - self._stamps[0]) / 1e9
+        if not len(self._spool) and (self._n_damaged - self._n_early > HOPELESS or waited_s > HOPELESS_S):
+            raise self._first_damage
 
 
 def stored_image(message: Message, view: ViewSpec) -> U8:
     """The image as it is stored: uint8 [H,W,C] at the view's size."""
     if view.depth is None:
-        return _fitted(decode_image(message, levels=view.levels), view)
+        return _fitted(decode_image(message, levels=view.levels, dark=True), view)
     metres = decode_depth.decode_depth(message, view.depth)
     try:
         fitted = geometry.fit_depth(metres, view.height, view.width, view.fit)
@@ -220,12 +236,12 @@ def stored_image(message: Message, view: ViewSpec) -> U8:
     return decode_depth.depth_levels(fitted, view.depth)
 
 
+def _fitted_rgb(rgb: Callable[[], U8], view: ViewSpec) -> U8:
+    return _fitted(rgb(), view)
+
+
 def _fitted(image: U8, view: ViewSpec) -> U8:
     try:
         return geometry.fit_image(image, view.height, view.width, view.fit)
     except UsageError as error:
         raise SpecError(error.what, where=view.topic, remedy=error.remedy) from error
-
-
-def _used(stamps_ns: I64, ticks_ns: I64, view: ViewSpec) -> align.Index:
-    return np.maximum(align.observe(stamps_ns, ticks_ns, stale_after_s=view.stale_after_s).index, 0)

@@ -74,13 +74,17 @@ class Environments:
         return Observation(frames, low_dim, np.asarray(infos["hold_action"], np.float32))
 
     def _frames(self, view: str, observation: Mapping[str, Any]) -> U8:
-        """uint8 [B,H,W,3] as they would be stored."""
+        """uint8 [B,H,W,C] as they would be stored."""
         if view not in observation:
             remedy = "compare the task's [views] with its [sim]"
             raise UsageError(f"the simulator has no view {view!r}", found=", ".join(observation), remedy=remedy)
         drawn, table = observation[view], self.spec.views[view]
-        if drawn.shape[1:3] == (table.height, table.width):
+        if drawn.shape[1:] == (table.height, table.width, table.channels):
             return np.asarray(drawn, np.uint8)
+        if table.depth is not None:  # its levels are no brightness: resizing would mix "no reading" into distances
+            what = f"the simulator's view {view!r} is not the depth that the task stores"
+            found = f"{drawn.shape[1:]} where {(table.height, table.width, 1)} is stored"
+            raise UsageError(what, found=found, remedy="draw levels of depth at the stored size, or take `depth` out")
         return np.stack([fit_image(image, table.height, table.width, table.fit) for image in drawn])
 
 

@@ -15,7 +15,7 @@ from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, nearest
 from vilp_data.keys import digest
 from vilp_data.latents import BATCH, encode_batches, read_latents, stale_reason
-from vilp_data.types import F16, I64, U8
+from vilp_data.types import F16, I64, U8, Bool
 from vilp_models.checkpoint import checkpoint_digest, read_state, refuse_trained_on_validation, run_for_view
 from vilp_models.lpips import Lpips, load_lpips
 from vilp_models.metrics import lpips_distance, moving_mask, psnr_from_mse, squared_error, temporal_median
@@ -232,9 +232,11 @@ def fidelity_report(
 def report_inputs(store: EpisodeStore, run_dir: Path, episodes: Sequence[str]) -> dict[str, Any]:
     """All that a report depends on, as plain data: a report written with equal inputs need not be made again."""
     entries = {entry.id: entry for entry in store.index()}
-    views = sorted(store.spec().views)
+    views, tables = sorted(store.spec().views), store.spec().views
+    depth = [view for view in views if tables[view].depth is not None]
     return {
         "format": REPORT_FORMAT,
+        **({"readings_only": depth} if depth else {}),  # reports of pictures have the numbers they had before
         "checkpoints": {view: checkpoint_digest(run_for_view(run_dir, view)) for view in views},
         "frames": {e: {view: entries[e].frames_id(view) for view in views} for e in sorted(episodes)},
         "mean_frame_of": {
@@ -244,7 +246,7 @@ def report_inputs(store: EpisodeStore, run_dir: Path, episodes: Sequence[str]) -
 
 
 def mean_frame(store: EpisodeStore, episodes: Sequence[EpisodeEntry], view: str) -> U8:
-    """Mean over all frames of these episodes, rounded: uint8 [H,W,3]."""
+    """Mean over all frames of these episodes, rounded: uint8 [H,W,C]; of depth over those with a reading there."""
     if not episodes:
         raise UsageError(
             "none of the run's training episodes is in this dataset",
@@ -252,13 +254,19 @@ def mean_frame(store: EpisodeStore, episodes: Sequence[EpisodeEntry], view: str)
             remedy="name the dataset it was trained on",
         )
     total: npt.NDArray[np.int64] | None = None
-    count = 0
+    count: npt.NDArray[np.int64] | int = 0
     for episode in episodes:
         frames = open_frames(store, episode, view)
         part = frames.sum(axis=0, dtype=np.int64)
-        total, count = part if total is None else total + part, count + len(frames)
+        total = part if total is None else total + part
+        count = count + has_reading(frames).sum(axis=0)[..., None]
     assert total is not None
-    return np.round(total / count).astype(np.uint8)
+    return np.round(total / np.maximum(count, 1)).astype(np.uint8)
+
+
+def has_reading(frames: U8) -> Bool:
+    """Which pixels tell anything, bool [...,H,W]: all of a picture's; of depth (one channel) those that are not 0, "no reading"."""
+    return np.any(frames > 0, axis=-1) if frames.shape[-1] == 1 else np.ones(frames.shape[:-1], np.bool_)
 
 
 def _training_entries(entries: Mapping[str, EpisodeEntry], run_dir: Path, view: str) -> list[EpisodeEntry]:
@@ -305,7 +313,8 @@ def _latents(store: EpisodeStore, encoder: VqganEncoder, key: str, view: str, en
 
 
 def _measure_episode(episode: str, view: str, frames: U8, decoded: U8, mean: U8, distance: float) -> EpisodeFidelity:
-    moving = moving_mask(frames, temporal_median(frames))
+    background = temporal_median(frames)
+    moving = moving_mask(frames, background) & has_reading(background)
     return EpisodeFidelity(
         episode=episode,
         view=view,
@@ -319,14 +328,19 @@ def _measure_episode(episode: str, view: str, frames: U8, decoded: U8, mean: U8,
 
 
 def errors_between(real: U8, other: U8, moving: npt.NDArray[np.bool_]) -> Errors:
-    """Errors of `other`, which broadcasts over frames, where `moving` bool [n,H,W] says what moves."""
+    """Errors of `other`, which broadcasts over frames, where `moving` bool [n,H,W] says what moves. Pixels of depth without a reading
+    in `real` do not count: whatever stands there is right."""
     out = Errors()
     for start in range(0, len(real), BATCH):  # float copies of a whole episode would not fit beside it
         part = slice(start, start + BATCH)
-        error = squared_error(real[part], other[part] if other.ndim == 4 else other)
-        mask = moving[part]
+        known = has_reading(real[part])
+        error = squared_error(real[part], other[part] if other.ndim == 4 else other) * known
+        mask = moving[part] & known
         out += Errors(
-            float(error.sum(dtype=np.float64)), error.size, float(error[mask].sum(dtype=np.float64)), int(mask.sum())
+            float(error.sum(dtype=np.float64)),
+            int(known.sum()),
+            float(error[mask].sum(dtype=np.float64)),
+            int(mask.sum()),
         )
     return out
 
@@ -351,7 +365,9 @@ def precision_cost(encoder: VqganEncoder, frames: U8, latents: F16) -> Precision
 
 def _worst(episode: str, view: str, frames: U8, decoded: U8) -> Iterator[WorstFrame]:
     """The episode's worst frames, WORST_GAP apart, so that one bad moment does not fill the sheet."""
-    mse = np.array([squared_error(real, fake).mean() for real, fake in zip(frames, decoded, strict=True)])
+    mse = np.array(
+        [(squared_error(real, fake) * has_reading(real)).mean() for real, fake in zip(frames, decoded, strict=True)]
+    )
     for _ in range(WORST_FRAMES):
         index = int(mse.argmax())
         if mse[index] < 0:

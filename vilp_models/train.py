@@ -16,8 +16,8 @@ from vilp_data.dataset_split import read_split, side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import BusyError, NoWindowError, UsageError, VilpDataError, nearest
 from vilp_data.pairs import PairDataset
-from vilp_data.shards import writer_lock
 from vilp_data.spec import TaskSpec, WindowSpec
+from vilp_data.writer_lock import remove_leftovers, writer_lock
 from vilp_models.checkpoint import RunState, read_recipe, read_state, run_folder
 from vilp_models.contract import ContractOf, DataContract
 from vilp_models.frames import TrainingFrames, open_clips
@@ -335,6 +335,7 @@ def _only_trainer(run: Path, processes: Processes) -> Iterator[None]:
         if processes.is_main:
             try:
                 stack.enter_context(writer_lock(run))
+                remove_leftovers(run)
             except VilpDataError as error:
                 refused = error
         if processes.any(refused is not None):

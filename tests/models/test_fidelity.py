@@ -15,6 +15,7 @@ from vilp_data.errors import SplitError, StoreError
 from vilp_data.latents import latents_path
 from vilp_data.shards import write_shard
 from vilp_data.spec import TaskSpec
+from vilp_models import fidelity
 from vilp_models.fidelity import Errors, FidelityReport, errors_between, fidelity_report, mean_frame, report_inputs
 from vilp_models.fidelity_page import contact_sheet, read_fresh_report, write_report
 from vilp_models.train import train_vqgan
@@ -90,6 +91,34 @@ def test_errors_add_up_to_those_of_everything_at_once() -> None:
     assert parts.psnr == pytest.approx(whole.psnr)
     assert parts.moving_psnr == pytest.approx(whole.moving_psnr)
     assert math.isnan(Errors().moving_psnr)
+
+
+def test_errors_of_depth_count_readings_only() -> None:
+    real = np.full((5, 4, 4, 1), 100, np.uint8)
+    real[:, 0] = 0
+    other = np.full((5, 4, 4, 1), 110, np.uint8)
+    moving = np.zeros((5, 4, 4), np.bool_)
+    moving[:, :2] = True
+    errors = errors_between(real, other, moving)
+    assert (errors.all_sum, errors.all_count) == (100.0 * 5 * 12, 5 * 12)
+    assert (errors.moving_sum, errors.moving_count) == (100.0 * 5 * 4, 5 * 4)
+
+
+def test_a_hole_of_depth_that_flickers_is_no_motion() -> None:
+    frames = np.full((9, 4, 4, 1), 200, np.uint8)
+    frames[::4, 0] = 0
+    frames[:, 1] = 0
+    frames[::4, 1] = 200
+    measured = fidelity._measure_episode("a", "depth", frames, frames + np.uint8(1), frames[0], 0.0)
+    assert measured.vqgan.moving_count == 0
+    frames[4:, 2] = 30
+    assert fidelity._measure_episode("a", "depth", frames, frames, frames[0], 0.0).vqgan.moving_count > 0
+
+
+def test_the_mean_frame_of_depth_is_that_of_its_readings(store: EpisodeStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = np.array([0, 0, 100, 120], np.uint8).reshape(4, 1, 1, 1)
+    monkeypatch.setattr(fidelity, "open_frames", lambda *_: frames)
+    assert mean_frame(store, store.index()[:2], "front").tolist() == [[[110]]]
 
 
 def test_the_report_is_written_for_programs_people_and_eyes(report: FidelityReport, tmp_path: Path) -> None:

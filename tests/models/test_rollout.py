@@ -106,6 +106,15 @@ def test_frames_come_at_the_size_the_dataset_stores() -> None:
     world.close()
 
 
+def test_depth_is_not_resized_as_if_it_were_brightness() -> None:
+    table = dot_task("options = { height = 16, width = 24 }").model_dump(by_alias=True)
+    table["views"]["top"]["depth"] = {"unit": "m", "near_m": 0.1, "far_m": 1.0}
+    world = Environments(TaskSpec.model_validate(table), 1)
+    with pytest.raises(UsageError, match="not the depth that the task stores"):
+        world.reset(seed_starts([0]))
+    world.close()
+
+
 @pytest.mark.parametrize("broken", [np.zeros((1, 2, 1), np.float32), np.full((1, 3, 1), np.nan, np.float32)])
 def test_actions_of_another_shape_or_not_finite_are_refused(spec: TaskSpec, broken: F32) -> None:
     policy = RandomPolicy()

@@ -14,8 +14,9 @@ from tests.models.conftest import HEIGHT, WIDTH, tiny_recipe
 from tests.models.tiny_training import in_two_processes
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import BusyError, StoreError, UsageError
-from vilp_data.shards import open_shard, read_shard, write_shard, writer_lock
+from vilp_data.shards import open_shard, read_shard, write_shard
 from vilp_data.spec import TaskSpec
+from vilp_data.writer_lock import writer_lock
 from vilp_models.checkpoint import FILE, load_checkpoint, model_tensors, read_state, run_folder
 from vilp_models.optimisation import DivergedError
 from vilp_models.processes import Processes

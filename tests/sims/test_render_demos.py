@@ -14,6 +14,8 @@ from tests.real_data import real_data
 from tests.synthetic import psnr, write_mcap
 from vilp_data.decode import decode_image
 from vilp_data.errors import LogError, UsageError
+from vilp_data.recorder import EpisodeRecorder
+from vilp_data.sims import render_demos
 from vilp_data.sims.render_demos import RenderOptions, render_demonstrations
 from vilp_data.sources import open_log
 
@@ -76,6 +78,64 @@ def test_a_model_outside_the_folder_is_not_read(tmp_path: Path) -> None:
         file["data/demo_1"].attrs["model_file"] = "../../secret.xml"
     with open_log(path) as log, pytest.raises(LogError, match="outside its own folder"):
         log.model_text("demo_1")  # type: ignore[attr-defined]
+
+
+# --- what is there already --------------------------------------------------------------------------------------------------------
+
+
+def lift_demo(path: Path, *, model: str = "<mujoco/>", **info: Any) -> Path:
+    write_states(path, np.zeros((3, 32)), None, env_info=lift_info(**info))
+    with h5py.File(path, "r+") as file:
+        file["data/demo_1"].attrs["model_file"] = model
+    return path
+
+
+def drawn(path: Path, out: Path, **changed: str) -> Path:
+    """A log as `render_demonstrations` leaves it, but for its pictures; `changed`: tags that another version wrote."""
+    (job,) = render_demos._jobs(path, out, RenderOptions())
+    tags = {**render_demos._tags(job, "Lift"), "success": "true", "n_steps": "3", **changed}
+    with EpisodeRecorder(job.path, metadata=tags) as recorder:
+        recorder.vector("/action", 1, [0.0])
+    return job.path
+
+
+def test_a_log_of_the_same_demonstration_is_kept(tmp_path: Path) -> None:
+    path = lift_demo(tmp_path / "demo.hdf5")
+    log = drawn(path, tmp_path / "logs")
+    before = log.stat().st_mtime_ns
+    (done,) = render_demonstrations([path], tmp_path / "logs", RenderOptions())
+    assert (done.path, done.n_steps, done.success) == (log, 3, True)
+    assert log.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"model": "<mujoco><worldbody/></mujoco>"}, "other world_sha256"),
+        ({"robots": "Sawyer"}, "other world_sha256"),
+        ({"mujoco_version": "3.2.0"}, "other mujoco_version: 3.2.0"),
+        ({"robosuite_version": "1.4.0"}, "other robosuite_version: 1.4.0"),
+    ],
+)
+def test_a_log_that_would_be_drawn_otherwise_now_is_refused(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    of_then = {name: text for name, text in change.items() if name.endswith("_version")}
+    log = drawn(lift_demo(tmp_path / "demo.hdf5"), tmp_path / "logs", **of_then)
+    path = lift_demo(tmp_path / "demo.hdf5", **{name: text for name, text in change.items() if name not in of_then})
+    before = log.read_bytes()
+    with pytest.raises(UsageError, match=says):
+        render_demonstrations([path], tmp_path / "logs", RenderOptions())
+    assert log.read_bytes() == before
+
+
+@pytest.mark.parametrize("damage", ["cut off", "foreign"])
+def test_a_damaged_or_foreign_file_is_not_overwritten(tmp_path: Path, damage: str) -> None:
+    path = lift_demo(tmp_path / "demo.hdf5")
+    log = drawn(path, tmp_path / "logs")
+    log.write_bytes(log.read_bytes()[:-30] if damage == "cut off" else b"notes on lifting")
+    before = log.read_bytes()
+    with pytest.raises(UsageError, match="in the way"):
+        render_demonstrations([path], tmp_path / "logs", RenderOptions())
+    assert log.read_bytes() == before
 
 
 # --- with the simulator -----------------------------------------------------------------------------------------------------------

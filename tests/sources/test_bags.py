@@ -431,8 +431,8 @@ def test_messages_that_the_index_does_not_count_are_an_error(tmp_path: Path) -> 
     place = content.rindex(struct.pack("<II", 0, 1))  # connection 0 has one message
     struct.pack_into("<II", content, place, 0, 2)
     path.write_bytes(content)
-    with open_log(path) as reader, pytest.raises(LogError, match="2 messages where the index counts 3"):
-        read_all(reader)
+    with pytest.raises(LogError, match="1 messages of connection 0, 2 by the bag's"):
+        open_log(path)
 
 
 def test_an_index_of_a_chunk_that_disagrees_with_the_bags_own_is_damage(tmp_path: Path, bag: Path) -> None:
@@ -443,8 +443,8 @@ def test_an_index_of_a_chunk_that_disagrees_with_the_bags_own_is_damage(tmp_path
     struct.pack_into("<I", content, place + 5, 77)
     path = tmp_path / "run.bag"
     path.write_bytes(content)
-    with open_log(path) as reader, pytest.raises(LogError, match="connection 77"):
-        reader.message_times()
+    with pytest.raises(LogError, match="0 messages of connection 0, 3 by the bag's"):
+        open_log(path)
 
 
 def test_files_that_a_bag_lacks_are_named(tmp_path: Path, log: SyntheticLog) -> None:

@@ -286,6 +286,24 @@ def test_a_rate_that_is_not_positive_is_wrong_use(path: Path) -> None:
         open_log(path, array_rate_hz=-1.0)
 
 
+@pytest.mark.parametrize("stated", ["1e-300", "1e12", "1e308", "NaN", "-5", "0"])
+def test_a_rate_that_rows_cannot_have_is_not_believed(tmp_path: Path, stated: str) -> None:
+    path = write_hdf5(tmp_path / "demos.hdf5")
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["env_args"] = f'{{"env_kwargs": {{"control_freq": {stated}}}}}'
+    with open_log(path, array_rate_hz=20.0) as log:
+        assert [len(actions(log, episode)) for episode in log.episodes()] == list(LENGTHS)
+        assert log.assumed_rate_hz == 20.0  # type: ignore[attr-defined]
+
+
+def test_a_file_that_counts_more_rows_than_it_has_is_doubted(path: Path) -> None:
+    for total, doubts in ((26, 0), (27, 1)):
+        with h5py.File(path, "r+") as file:
+            file["data"].attrs["total"] = total
+        with open_log(path) as log:
+            assert len(log.doubts()) == doubts
+
+
 def test_real_robosuite_demonstrations_give_states_and_actions() -> None:
     root = "robosuite_demos/v1.0.1/robosuite/models/assets/demonstrations"
     with open_log(real_data(f"{root}/lift/panda/demo.hdf5"), array_rate_hz=20.0) as log:

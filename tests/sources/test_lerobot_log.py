@@ -14,9 +14,11 @@ import pytest
 
 from tests.lerobot_folders import CAMERA, LeRobotFolder, number_of, write_v3, write_v21, write_video
 from tests.real_data import real_data
+from vilp_data import limits
 from vilp_data.decode import decode_image
 from vilp_data.errors import LogError
-from vilp_data.sources import IndexedLog, open_log
+from vilp_data.log_summary import format_summary, summarise
+from vilp_data.sources import IndexedLog, lerobot_table, open_log
 from vilp_data.types import LogEpisode
 
 NTSC = Fraction(30_000, 1001)
@@ -156,13 +158,54 @@ def assert_only_episode_1_fails(folder: LeRobotFolder, says: str) -> None:
     assert caught.value.remedy
 
 
+def test_a_list_of_episodes_that_was_cut_off_is_doubted(tmp_path: Path) -> None:
+    folder = write_v21(tmp_path / "set")
+    with open_log(folder.path) as log:
+        assert log.doubts() == []
+    listed = folder.path / "meta" / "episodes.jsonl"
+    lines = listed.read_text().splitlines(keepends=True)
+    listed.write_text(lines[0])
+    with open_log(folder.path) as log:
+        assert len(log.episodes()) == 1
+        assert "meta/info.json counts 3 episodes, the list of episodes holds 1" in log.doubts()
+    listed.write_text(lines[0] + lines[2])
+    with open_log(folder.path) as log:
+        assert "the list of episodes leaves out 1 of them, from episode 1 on" in log.doubts()
+
+
+def test_the_headline_counts_what_is_there(tmp_path: Path) -> None:
+    folder = write_v21(tmp_path / "set")
+    folder.video(1).unlink()
+    folder.table(2).unlink()
+    summary = summarise(folder.path)
+    text = format_summary(summary)
+    assert "1 of 3 episodes have all their files" in text.splitlines()[0]
+    counts = {topic.name: topic.n_messages for topic in summary.topics}
+    first, second, _ = folder.lengths
+    assert (counts[CAMERA], counts["observation.state"]) == (first, first + second)
+    assert f"1 of 3 episodes lack their video {CAMERA}" in text
+    assert "1 of 3 episodes lack their table" in text
+
+
+def test_rows_too_wide_for_memory_are_read_a_few_at_a_time_or_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_v21(tmp_path / "set", lengths=(40,))
+    monkeypatch.setattr(lerobot_table, "BATCH_BYTES", 100)
+    with open_log(folder.path) as log:
+        assert states(log, log.episodes()[0]) == list(range(40))
+    monkeypatch.setattr(limits, "ARRAY_CHUNK_BYTES", 7)
+    with open_log(folder.path) as log, pytest.raises(LogError, match="VILP_MAX_ARRAY_CHUNK_BYTES"):
+        states(log, log.episodes()[0])
+
+
 def test_a_missing_video(tmp_path: Path) -> None:
     folder = write_v21(tmp_path / "set")
     folder.video(1).unlink()
     assert_only_episode_1_fails(folder, "the video is missing")
     with open_log(folder.path) as log:
         assert len(states(log, log.episodes()[1])) == 15  # its numbers can be had
-        assert log.metadata()["missing files"] == {CAMERA: "1 of 3 episodes"}
+        assert log.doubts() == [f"1 of 3 episodes lack their video {CAMERA}"]
 
 
 def test_a_missing_table(tmp_path: Path) -> None:

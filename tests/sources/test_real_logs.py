@@ -81,6 +81,7 @@ def test_inspect_agrees_with_the_fields_own_readers(name: str | None) -> None:
     summary = summary_of(path)
     assert {topic.name: topic.n_messages for topic in summary.topics if topic.n_messages} == expected
     assert format_summary(summary)
+    assert summary.doubts == ()
     assert (summary.n_episodes, summary.duration_s > 0) == ((1, True) if expected else (0, False))
 
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numcodecs
 import numpy as np
 import pytest
 import zarr
 
 from tests.real_data import real_data
 from tests.synthetic import SyntheticZarr, write_zarr
+from vilp_data import limits
 from vilp_data.decode import decode_image, decode_vector
 from vilp_data.errors import LogError, UsageError
 from vilp_data.sources import open_log
+from vilp_data.sources.zarr_chunks import inflated_bytes
 
 
 @pytest.fixture
@@ -122,9 +126,85 @@ def test_damaged_array_metadata_is_refused(store: SyntheticZarr) -> None:
         open_log(store.path)
 
 
-def test_a_rate_that_is_not_positive_is_wrong_use(store: SyntheticZarr) -> None:
+def store_of(path: Path, array: np.ndarray, ends: list[int], **options: Any) -> Path:
+    """A zarr v3 store of one array, data/action."""
+    root = zarr.open_group(path, mode="w")
+    root.create_group("data").create_array("action", data=array, **options)
+    root.create_group("meta").create_array("episode_ends", data=np.array(ends))
+    return path
+
+
+def test_a_sharded_store_is_read_and_its_missing_shard_named(tmp_path: Path) -> None:
+    rows = np.arange(1, 25, dtype=np.float32).reshape(12, 2)
+    path = store_of(tmp_path / "sharded.zarr", rows, [5, 12], chunks=(2, 2), shards=(4, 2))
+    with open_log(path) as log:
+        assert np.array_equal([message.body for message in log.messages(["action"])], rows)
+    (path / "data" / "action" / "c" / "2" / "0").unlink()
+    with open_log(path) as log, pytest.raises(LogError, match="lacks its chunk c/2/0"):
+        list(log.messages(["action"]))
+
+
+def test_rows_behind_the_last_episode_are_doubted(store: SyntheticZarr) -> None:
+    with open_log(store.path) as log:
+        assert log.doubts() == []
+    root = zarr.open_group(store.path, mode="r+")
+    root["meta/episode_ends"].resize((2,))  # as a writer that crashed leaves it
+    with open_log(store.path) as log:
+        assert len(log.episodes()) == 2
+        assert [
+            f"data/{name} has 5 rows in no demonstration" in log.doubts()[k]
+            for k, name in enumerate(("action", "img", "state"))
+        ]
+
+
+def test_an_array_whose_metadata_is_damaged_is_doubted(store: SyntheticZarr) -> None:
+    metadata = store.path / "data" / "img" / ".zarray"
+    metadata.write_text(metadata.read_text().replace('"dtype"', '"type"'))
+    with open_log(store.path) as log:
+        assert [topic.name for topic in log.topics()] == ["action", "state"]
+        assert "data/img is read as no array" in log.doubts()[0]
+
+
+CODECS = {
+    "zstd": zarr.codecs.ZstdCodec(), "gzip": zarr.codecs.GzipCodec(), "blosc": zarr.codecs.BloscCodec(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_chunk_that_is_small_in_words_and_large_in_bytes_is_refused_before_it_is_inflated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str
+) -> None:
+    monkeypatch.setattr(limits, "ARRAY_CHUNK_BYTES", 100_000)
+    wide = store_of(tmp_path / "wide.zarr", np.ones((1, 5_000_000), np.uint8), [1], compressors=CODECS[codec])
+    with open_log(wide) as log, pytest.raises(LogError, match="VILP_MAX_ARRAY_CHUNK_BYTES"):
+        log.first_messages("action", 1)
+    fair = np.random.default_rng(0).integers(0, 255, (100, 100)).astype(np.uint8)
+    path = store_of(tmp_path / "small.zarr", fair, [100], compressors=CODECS[codec], chunks=(100, 100))
+    with open_log(path) as log:
+        assert np.array_equal([message.body for message in log.messages(["action"])], fair)
+    (bomb,) = (file for file in (wide / "data" / "action" / "c").rglob("*") if file.is_file() and file.name == "0")
+    (path / "data" / "action" / "c" / "0" / "0").write_bytes(bomb.read_bytes())
+    with open_log(path) as log, pytest.raises(LogError, match="VILP_MAX_ARRAY_CHUNK_BYTES"):
+        log.first_messages("action", 1)
+
+
+@pytest.mark.parametrize("name", ["gzip", "bz2", "lzma", "zlib", "lz4", "zstd", "blosc", ""])
+def test_what_a_chunk_inflates_to_is_told_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(limits, "ARRAY_CHUNK_BYTES", 50_000)
+    codec = numcodecs.get_codec({"id": name}) if name else None
+    path = tmp_path / "array"
+    array = zarr.create_array(path, data=np.ones(40_000, np.uint8), chunks=(40_000,), zarr_format=2, compressors=codec)
+    assert inflated_bytes(array, path / "0") <= 40_000
+    array = zarr.create_array(path, data=np.ones(9_000_000, np.uint8), chunks=(9_000_000,), zarr_format=2,
+                              compressors=codec, overwrite=True)  # fmt: skip
+    assert inflated_bytes(array, path / "0") > 50_000
+    assert (path / "0").stat().st_size < 50_000 or not name
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e-300, 1e12, float("nan"), float("inf")])
+def test_a_rate_that_rows_cannot_have_is_wrong_use(store: SyntheticZarr, rate_hz: float) -> None:
     with pytest.raises(UsageError, match="array_rate_hz"):
-        open_log(store.path, array_rate_hz=0.0)
+        open_log(store.path, array_rate_hz=rate_hz)
 
 
 def test_human_pusht_store_has_206_episodes_of_0_to_255_images() -> None:

@@ -37,7 +37,7 @@ Moved = Callable[[float, float], bool | None]
 
 
 @dataclass(frozen=True)
-class Glance:
+class FrameSample:
     """One sampled image: when (s), its mean grey level and the largest deviation of a channel (of 255), a checksum of what was looked
     at, and a grey thumbnail float32 [8,8], by which demonstrations are compared."""
 
@@ -48,33 +48,33 @@ class Glance:
     thumbnail: F32
 
 
-def glance(frame: U8, at_s: float) -> Glance:
+def sample_frame(frame: U8, at_s: float) -> FrameSample:
     """Look at an image uint8 [H,W,C]."""
     stride = max(frame.shape[0] // GRID_ROWS, 1)
     seen = np.ascontiguousarray(frame[::stride, ::stride])
     mean, deviation = cv2.meanStdDev(seen)
     small = geometry.fit_image(seen, THUMBNAIL_SIZE, THUMBNAIL_SIZE, "stretch")
     grey = small.reshape(THUMBNAIL_SIZE, THUMBNAIL_SIZE, -1).mean(axis=2, dtype=np.float32)
-    return Glance(at_s, float(mean.mean()), float(deviation.max()), zlib.crc32(seen.data), grey)
+    return FrameSample(at_s, float(mean.mean()), float(deviation.max()), zlib.crc32(seen.data), grey)
 
 
-def thumbnails_of(glances: list[Glance]) -> F32 | None:
+def thumbnails_of(samples: list[FrameSample]) -> F32 | None:
     """float32 [COMPARED,8,8]: thumbnails evenly spaced along a demonstration, by which two are compared; None where no image was
     sampled."""
-    if not glances:
+    if not samples:
         return None
-    chosen = np.linspace(0, len(glances) - 1, COMPARED).round().astype(int)
-    return np.stack([glances[i].thumbnail for i in chosen.tolist()])
+    chosen = np.linspace(0, len(samples) - 1, COMPARED).round().astype(int)
+    return np.stack([samples[i].thumbnail for i in chosen.tolist()])
 
 
-def camera_findings(topic: str, glances: list[Glance], *, moved: Moved) -> Iterator[Finding]:
+def camera_findings(topic: str, samples: list[FrameSample], *, moved: Moved) -> Iterator[Finding]:
     """What is wrong with a camera, by its sampled images in order of time."""
-    if not glances:
+    if not samples:
         return
-    at_s = np.array([g.at_s for g in glances])
-    mean = np.array([g.mean for g in glances])
-    flat = np.array([g.deviation for g in glances]) < FLAT_DEVIATION
-    black = (mean < BLACK_LEVEL) & (np.array([g.deviation for g in glances]) < BLACK_LEVEL)
+    at_s = np.array([g.at_s for g in samples])
+    mean = np.array([g.mean for g in samples])
+    flat = np.array([g.deviation for g in samples]) < FLAT_DEVIATION
+    black = (mean < BLACK_LEVEL) & (np.array([g.deviation for g in samples]) < BLACK_LEVEL)
     yield from _blank(
         topic, at_s, mean, black, "black", "the picture is black", "uncover the lens, or look at exposure and light"
     )
@@ -87,7 +87,7 @@ def camera_findings(topic: str, glances: list[Glance], *, moved: Moved) -> Itera
         "the picture is of one colour",
         "look at exposure and at the driver's output",
     )
-    yield from _frozen(topic, glances, at_s, black | flat, moved)
+    yield from _frozen(topic, samples, at_s, black | flat, moved)
 
 
 def _blank(topic: str, at_s: F64, mean: F64, bad: Bool, kind: str, what: str, act: str) -> Iterator[Finding]:
@@ -105,13 +105,13 @@ def _blank(topic: str, at_s: F64, mean: F64, bad: Bool, kind: str, what: str, ac
     )  # fmt: skip
 
 
-def _frozen(topic: str, glances: list[Glance], at_s: F64, blank: Bool, moved: Moved) -> Iterator[Finding]:
+def _frozen(topic: str, samples: list[FrameSample], at_s: F64, blank: Bool, moved: Moved) -> Iterator[Finding]:
     """Runs of identical pictures while something moved; a whole recording of one picture even where nothing tells."""
-    for first, last in _runs([g.checksum for g in glances]):
+    for first, last in _runs([g.checksum for g in samples]):
         seconds = float(at_s[last] - at_s[first])
         if seconds < FROZEN_S or last - first < FROZEN_S * SAMPLE_HZ - 1 or blank[first]:
             continue
-        whole = first == 0 and last == len(glances) - 1
+        whole = first == 0 and last == len(samples) - 1
         motion = moved(float(at_s[first]), float(at_s[last]))
         if motion is False or (motion is None and not whole):
             continue

@@ -1,4 +1,5 @@
-"""A dataset folder looked at once: every stored file verified, every episode's vectors judged, two frames a second looked at."""
+"""A dataset folder looked at once: the bytes of every stored file verified (episodes, latents, what waits for an undo, the split by its own
+hash), every episode's vectors judged, two frames a second looked at."""
 
 from __future__ import annotations
 
@@ -9,19 +10,23 @@ from pathlib import Path
 import numpy as np
 
 from vilp_data import shards
-from vilp_data.check.action import MAX_STEPS, Stretch
-from vilp_data.check.cameras import SAMPLE_HZ, Glance, camera_findings, glance, thumbnails_of
+from vilp_data.check.action_fit import MAX_STEPS, Trajectory
+from vilp_data.check.cameras import SAMPLE_HZ, FrameSample, camera_findings, sample_frame, thumbnails_of
 from vilp_data.check.findings import Finding, Place, Severity, placed, worst_first
-from vilp_data.check.motion import Series, idle_ends, idle_findings, moved_between, moving_columns, series_findings
+from vilp_data.check.motion import Series, idle_ends, idle_findings, moved_between, series_findings
 from vilp_data.check.report import Checked, Sheet, Steps, TopicFacts
+from vilp_data.check.stored_files import damaged, held_findings, latent_findings
 from vilp_data.check.tracks import PICTURES, picture_of
-from vilp_data.dataset_split import find_split
+from vilp_data.dataset_split import check_dataset_split, find_split
 from vilp_data.duplicates import near_duplicates
-from vilp_data.episode_files import INGEST_AGAIN, open_frames, open_steps
+from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import StoreError, VilpDataError
+from vilp_data.errors import UsageError, VilpDataError
+from vilp_data.idle import moving_columns
+from vilp_data.locate import is_dataset
 from vilp_data.plots import vector_parts
 from vilp_data.spec import TaskSpec
+from vilp_data.split_lock import SplitLock
 from vilp_data.types import F32, F64, U8, Bool
 from vilp_data.windows import valid_runs
 
@@ -33,13 +38,17 @@ SERIOUS_NOTES = re.compile(r"damaged|older than|missing, stale")
 
 
 def check_dataset(root: Path) -> Checked:
-    """Everything that is wrong with the dataset at `root`. A damaged file is a finding. UsageError where `root` is no dataset."""
+    """Everything that is wrong with the dataset at `root`. Never raises for what is in it: a damaged file is a finding. UsageError where
+    `root` is no dataset."""
+    if not is_dataset(root):
+        raise UsageError(
+            "not a dataset: it has no dataset.json", where=root, remedy="`vilp-data ingest LOGS…` makes one"
+        )
     store = EpisodeStore(root)
-    spec = store.spec()
     try:
-        entries = store.index()
-    except StoreError as error:
-        return Checked(str(root), "dataset", "dataset", (_damaged(error, str(root), None),))
+        spec, entries = store.spec(), store.index()
+    except VilpDataError as error:
+        return Checked(str(root), "dataset", "dataset", (damaged(error, str(root), None),))
     return _Look(store, spec, entries).run()
 
 
@@ -51,7 +60,7 @@ class _Look:
         self.findings: list[Finding] = []
         self.pictures: dict[str, list[tuple[str, U8]]] = {view: [] for view in spec.views}
         self.thumbnails: dict[str, F32] = {}
-        self.stretches: list[Stretch] = []
+        self.trajectories: list[Trajectory] = []
         self.moved: dict[str, Bool] = {}  # episode -> which columns of low_dim move in it
         self.columns: tuple[str, ...] = ()
 
@@ -62,13 +71,13 @@ class _Look:
         for number, entry in enumerate(self.entries):
             try:
                 self._look(entry, with_picture=number % every == 0)
-            except StoreError as error:
-                self.findings.append(_damaged(error, self.source, entry.id))
+            except VilpDataError as error:
+                self.findings.append(damaged(error, self.source, entry.id))
+        self.findings += [*latent_findings(self.store.root, self.entries), *held_findings(self.store.root)]
         self._never_moving()
-        self._look_alike()
-        self._split()
+        self._look_alike(self._split())
         rate_hz = self.entries[0].rate_hz if self.entries else 0.0
-        steps = Steps("action", rate_hz, True, tuple(self.stretches)) if self.stretches else None
+        steps = Steps("action", rate_hz, True, tuple(self.trajectories)) if self.trajectories else None
         return Checked(
             source=self.source, kind="dataset", format=f"dataset, task {self.spec.name}",
             findings=tuple(worst_first(self.findings)), size_bytes=_size(self.store), n_episodes=len(self.entries),
@@ -84,11 +93,7 @@ class _Look:
             self.store.steps_path(entry.id),
             *(self.store.frames_path(v, entry.id) for v in entry.frames_sha256),
         ):
-            try:
-                shards.verify_shard(path)
-            except StoreError as error:
-                self.findings.append(_damaged(error, self.source, entry.id))
-                return
+            shards.verify_shard(path)
         arrays = open_steps(self.store, entry, entry.frames_sha256)
         at_s = (arrays["log_time_ns"] - arrays["log_time_ns"][0]) / 1e9
         valid = np.asarray(arrays["valid"])
@@ -103,39 +108,40 @@ class _Look:
         if state.values.shape[1]:
             self.moved[entry.id] = moving_columns(state.values)
             self.columns = tuple(state.names)
-            idle = idle_ends(state)
-            if idle is not None:
-                remedy = f"`vilp-data trim {self.source}` takes idle ends off without decoding anything again"
-                found += idle_findings(idle, float(at_s[-1]), remedy)
+        vectors = [arrays[name].astype(np.float64) for name in ("low_dim", "action") if name in arrays]
+        idle = idle_ends(np.concatenate(vectors, axis=1), at_s, valid)  # as `trim` looks at it
+        if idle is not None:
+            remedy = f"`vilp-data trim {self.source}` takes idle ends off without decoding anything again"
+            found += idle_findings(idle, float(at_s[-1]), remedy)
 
         def moved(start_s: float, end_s: float) -> bool | None:
             return moved_between(state, start_s, end_s) if state.values.shape[1] else None
 
         seen: list[F32] = []
         for view in sorted(entry.frames_sha256):
-            glances = self._glances(entry, view, arrays[f"source_index/{view}"], at_s, with_picture=with_picture)
-            found += camera_findings(f"view {view}", glances, moved=moved)
-            small = thumbnails_of(glances)
+            samples = self._samples(entry, view, arrays[f"source_index/{view}"], at_s, with_picture=with_picture)
+            found += camera_findings(f"view {view}", samples, moved=moved)
+            small = thumbnails_of(samples)
             seen += [small] if small is not None else []
         if seen:
             self.thumbnails[entry.id] = np.concatenate(seen)
         self.findings += placed(found, self.source, entry.id)
-        if action is not None and state.values.shape[1] and sum(len(s.valid) for s in self.stretches) <= MAX_STEPS:
-            self.stretches.append(
-                Stretch(entry.id, arrays["low_dim"].astype(np.float64), arrays["action"].astype(np.float64), valid)
+        if action is not None and state.values.shape[1] and sum(len(s.valid) for s in self.trajectories) <= MAX_STEPS:
+            self.trajectories.append(
+                Trajectory(entry.id, arrays["low_dim"].astype(np.float64), arrays["action"].astype(np.float64), valid)
             )
 
-    def _glances(
+    def _samples(
         self, entry: EpisodeEntry, view: str, source_index: np.ndarray[tuple[int], np.dtype[np.int32]], at_s: F64, *,
         with_picture: bool,
-    ) -> list[Glance]:  # fmt: skip
+    ) -> list[FrameSample]:  # fmt: skip
         frames = open_frames(self.store, entry, view)
         stride = max(round(entry.rate_hz / SAMPLE_HZ), 1)
         steps = range(0, len(at_s), stride)
         if with_picture:
             middle = len(at_s) // 2
             self.pictures[view].append((f"{entry.id}, {at_s[middle]:.1f} s", picture_of(frames[source_index[middle]])))
-        return [glance(frames[source_index[step]], float(at_s[step])) for step in steps]
+        return [sample_frame(frames[source_index[step]], float(at_s[step])) for step in steps]
 
     def _labels(self, arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str) -> list[str]:
         parts = vector_parts(arrays[vector], self.spec.low_dim if vector == "low_dim" else self.spec.action)
@@ -187,8 +193,7 @@ class _Look:
                     self._say("warning", "stuck-joint", what, "look at its log; leave it out if the sensor had failed",
                               topic="low_dim", episode=id)  # fmt: skip
 
-    def _look_alike(self) -> None:
-        lock = find_split(self.store.root)
+    def _look_alike(self, lock: SplitLock | None) -> None:
         contents: dict[str, str] = {}
         for entry in self.entries:
             first = contents.setdefault(entry.content_sha256, entry.id)
@@ -211,16 +216,19 @@ class _Look:
                 evidence={"distance_grey_levels": pair.distance}, remedy=remedy,
             ))  # fmt: skip
 
-    def _split(self) -> None:
-        from vilp_data.dataset_split import check_dataset_split
-
+    def _split(self) -> SplitLock | None:
+        """What is wrong with the split; the split, where there is one that can be read."""
         try:
-            sentences = check_dataset_split(self.store.root)
+            lock, sentences = find_split(self.store.root), check_dataset_split(self.store.root)
         except VilpDataError as error:
-            sentences = [error.what]
+            told = {finding.evidence.get("file") for finding in self.findings}
+            if str(error.where) not in told:
+                self.findings.append(damaged(error, self.source, None))
+            return None
         for sentence in sentences:
             none_yet = sentence.startswith("no split yet")
             self._say("note" if none_yet else "warning", "split", sentence, f"`vilp-data split {self.source}`")
+        return lock
 
     def _facts(self) -> Iterator[TopicFacts]:
         for view, table in self.spec.views.items():
@@ -241,19 +249,6 @@ class _Look:
 def _values(arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str, valid: Bool) -> F64:
     """A stored vector at the steps that may be used, float64 [v,D]: the others hold zeros."""
     return arrays[vector].astype(np.float64)[valid]
-
-
-def _damaged(error: StoreError, source: str, episode: str | None) -> Finding:
-    evidence = {"found": str(error.found), "file": str(error.where)}
-    place = Place(source=source, episode=episode)
-    return Finding(
-        severity="error",
-        kind="damaged",
-        place=place,
-        what=error.what,
-        evidence=evidence,
-        remedy=error.remedy or INGEST_AGAIN,
-    )
 
 
 def _size(store: EpisodeStore) -> int:

@@ -1,6 +1,6 @@
 """What a check finds, and how findings are put in order: worst first, the same complaint about many places told once. Pure.
 
-The judges themselves are `check_timing`, `check_cameras`, `check_motion` and `check_action`; each takes arrays and yields findings.
+The judges themselves are `timing`, `cameras`, `motion` and `action`; each takes arrays and yields findings.
 """
 
 from __future__ import annotations

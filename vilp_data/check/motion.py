@@ -9,16 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vilp_data.check.findings import Finding, Place, Severity
+from vilp_data.idle import IDLE_S, IDLE_SHARE, moving_columns, moving_range
 from vilp_data.types import F64, Bool
-
-NOISE = 1.0
-"""Variance of differences over variance of values: 2 for white noise, near 0 for motion. From here on a column only trembles."""
-
-IDLE_SHARE = 0.02
-"""A column has left its resting value once it is this share of its range away."""
-
-IDLE_S = 1.0
-"""A shorter pause at either end is a person drawing breath."""
 
 STUCK_S = 1.0
 """All columns bit for bit the same for so long, in a vector that never repeats otherwise: its source sends its last value again."""
@@ -59,7 +51,7 @@ class Series:
 
 
 def series_findings(series: Series, *, busy: Series | None = None) -> Iterator[Finding]:
-    """What is wrong with a stretch of vectors. `busy`: commands meant for this state, if they are known."""
+    """What is wrong with a segment of vectors. `busy`: commands meant for this state, if they are known."""
     finite = np.isfinite(series.values)
     yield from _not_finite(series, finite)
     whole = np.asarray(finite.all(axis=0))
@@ -73,30 +65,14 @@ def series_findings(series: Series, *, busy: Series | None = None) -> Iterator[F
     yield from _saturated(kept)
 
 
-def moving_columns(values: F64) -> Bool:
-    """Which columns move, bool [D], rather than rest or only tremble."""
-    if len(values) < 3:
-        return np.zeros(values.shape[1], np.bool_)
-    variance = values.var(axis=0)
-    return np.asarray((variance > 0) & (np.diff(values, axis=0).var(axis=0) < NOISE * variance))
-
-
-def idle_ends(series: Series) -> tuple[float, float] | None:
-    """Seconds in which the robot stands still at the start and at the end; None where nothing moves in between."""
-    values = series.values[:, np.isfinite(series.values).all(axis=0)]
-    values = values[:, moving_columns(values)]
-    if not values.shape[1] or len(values) < MIN_ROWS:
+def idle_ends(values: F64, at_s: F64, valid: Bool | None = None) -> tuple[float, float] | None:
+    """Seconds in which nothing of `values` float64 [n,D] at `at_s` float64 [n] moves, at the start and at the end, as `vilp-data trim`
+    finds them; None where nothing moves in between. Steps that are not `valid` say nothing."""
+    moving = moving_range(values, valid)
+    if moving is None:
         return None
-    # The ends' own medians: the first values alone may be noise.
-    few = max(min(len(values) // 20, 5), 1)
-    span = np.ptp(values, axis=0)
-    away_from_start = (np.abs(values - np.median(values[:few], axis=0)) > IDLE_SHARE * span).any(axis=1)
-    away_from_end = (np.abs(values - np.median(values[-few:], axis=0)) > IDLE_SHARE * span).any(axis=1)
-    first = int(np.argmax(away_from_start))
-    last = len(values) - 1 - int(np.argmax(away_from_end[::-1]))
-    return float(series.at_s[max(first - 1, 0)] - series.at_s[0]), float(
-        series.at_s[-1] - series.at_s[min(last + 1, len(values) - 1)]
-    )
+    first, end = moving
+    return float(at_s[first] - at_s[0]), float(at_s[-1] - at_s[end - 1])
 
 
 def idle_findings(idle_s: tuple[float, float], length_s: float, remedy: str | None) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 import re
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -16,7 +17,8 @@ from vilp_data.check.report import Checked, Fit, Sheet, TopicFacts
 from vilp_data.check.sources import CheckReport
 from vilp_data.check.style import STYLE
 from vilp_data.check.svg import fit_bars, lag_line, lane
-from vilp_data.check.text import duration, shown_evidence, where
+from vilp_data.check.text import duration, said_of, shown_evidence, where
+from vilp_data.errors import UsageError
 from vilp_data.types import U8
 
 JPEG_QUALITY = 82
@@ -31,6 +33,16 @@ MOST_PICTURES = 600
 def write_page(path: Path, report: CheckReport) -> None:
     """Write the page, whole or not at all. StoreError where the folder cannot be written."""
     shards.write_atomic(path, page(report).encode())
+
+
+def require_place(path: Path) -> None:
+    """UsageError where no page can be written as `path`: to be known before an hour of checking, not after it."""
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        found = "a folder" if path.is_dir() else f"{folder} is no folder that can be written to"
+        raise UsageError(
+            "a page cannot be written there", where=path, found=found, remedy="name a file, such as check.html"
+        )
 
 
 def page(report: CheckReport) -> str:
@@ -136,13 +148,15 @@ def _fits(fits: Sequence[Fit]) -> str:
         return ""
     lead = (
         '<p class="soft">Of the motion that the robot\'s own past leaves open: how much does the action explain, if it were stored'
-        " some steps earlier or later? Rightly stored actions are best at 0; best at +1 means one step late.</p>"
+        " some steps earlier or later? Smooth commands explain it nearly as well a step later, so what is said below each drawing"
+        " rests on what later and earlier actions add to each other.</p>"
     )
     return lead + f'<div class="fits">{"".join(map(_fit, fits))}</div>'
 
 
 def _fit(fit: Fit) -> str:
     told = f"{fit.fit.n_steps:,} steps at {fit.rate_hz:.3g} Hz; its own past alone explains {max(fit.fit.own_past, 0):.0%}."
+    told += f" {said_of(fit.fit).capitalize()}."
     return (
         f"<figure>{fit_bars(fit.fit)}<figcaption><strong>{escape(fit.topic)}</strong><br>{told}</figcaption></figure>"
     )

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 
 from vilp_data import decode
-from vilp_data.decode.depth import is_depth, measured_depth
+from vilp_data.decode.depth import is_depth, is_grey16, measured_depth
 from vilp_data.decode.images import unpacked, whole_file
-from vilp_data.decode.video import RgbReader, VideoDecoder, is_video, packet_of, video_codec
+from vilp_data.decode.video import RgbReader, VideoDecoder
+from vilp_data.decode.video_packet import describes, is_video, packet_of, video_codec
 from vilp_data.types import U8, Message
 
 DEPTH_PERCENTILE = 95
@@ -30,15 +31,16 @@ class PictureReader:
     def __init__(self) -> None:
         self.image: str | None = None
         self._depth_top: float | None = None
+        self._parameters: dict[int, bytes] = {}
         self._to_rgb: RgbReader | None = None
 
     def read(self, message: Message) -> U8 | None:
         """uint8 [h,w,3], or [h,w,1] for depth, perhaps smaller than it was sent; None for a packet of video that decoding cannot begin
         with. DecodeError as `decode` raises it."""
-        if is_depth(message):
-            return self._noted(message, self._depth(message))
         if is_video(message):
             return self._noted(message, self._keyframe(message))
+        if is_depth(message) or is_grey16(message):
+            return self._noted(message, self._depth(message))
         if message.schema in decode.COMPRESSED_IMAGES:
             return self._reduced(message)
         return self._noted(message, decode.decode_image(message))
@@ -65,10 +67,13 @@ class PictureReader:
         return np.asarray(np.clip(measured * (255.0 / self._depth_top), 0, 255)[..., None], np.uint8)
 
     def _keyframe(self, message: Message) -> U8 | None:
-        """Only keyframes are decoded: one stands alone, and decoding the packets between would cost as much as ingest."""
-        if not packet_of(message).keyframe:
+        """Only keyframes are decoded: one stands alone, given the parameters that may have come before it, and decoding the packets
+        between would cost as much as ingest."""
+        packet = packet_of(message)
+        self._parameters |= packet.parameters
+        if not packet.keyframe or not describes(packet.codec, self._parameters):
             return None
-        decoder = VideoDecoder()
+        decoder = VideoDecoder(self._parameters)
         self._to_rgb = self._to_rgb or RgbReader()
         for _, frame in [*decoder.feed(0, message), *decoder.rest()]:
             return self._to_rgb.rgb(frame)

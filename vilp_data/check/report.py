@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from vilp_data.check.action import ActionFit, Stretch
+from vilp_data.check.action_fit import ActionFit, Trajectory
 from vilp_data.check.findings import Finding
 from vilp_data.check.timing import Timing
-from vilp_data.types import F32, F64, U8
+from vilp_data.types import F32, F64, RATE_TOLERANCE, U8
 
 BINS = 360
 """Intervals and lags of a topic are kept as so many bins along the log, whatever its length: what a page can draw."""
@@ -80,13 +80,15 @@ class Steps:
     topic: str
     rate_hz: float
     certain: bool
-    stretches: tuple[Stretch, ...]
+    trajectories: tuple[Trajectory, ...]
 
-    @property
-    def shape(self) -> tuple[str, bool, int, int]:
-        """What must be alike for steps of several logs to be judged together."""
-        first = self.stretches[0]
-        return self.topic, self.certain, first.state.shape[1], first.action.shape[1]
+    def fits(self, other: Steps) -> bool:
+        """Whether both can be judged together: the same topics and widths, and steps of one length. At two rates a step late is two
+        different times."""
+        one, two = self.trajectories[0], other.trajectories[0]
+        widths = [(first.state.shape[1], first.action.shape[1]) for first in (one, two)]
+        alike = (self.topic, self.certain, widths[0]) == (other.topic, other.certain, widths[1])
+        return alike and abs(self.rate_hz / other.rate_hz - 1) <= RATE_TOLERANCE
 
 
 @dataclass(frozen=True)

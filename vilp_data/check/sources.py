@@ -5,20 +5,22 @@ Actions are judged over all demonstrations of the same topics together, and demo
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
-from vilp_data.check.action import Stretch, action_findings, fit_action
+from vilp_data.check.action import action_findings
+from vilp_data.check.action_fit import fit_action
 from vilp_data.check.dataset import check_dataset
 from vilp_data.check.findings import Finding, Place, worst_first
 from vilp_data.check.log import check_log
 from vilp_data.check.report import Checked, Fit, Steps
 from vilp_data.duplicates import near_duplicates
 from vilp_data.engine import map_unordered
+from vilp_data.errors import VilpDataError
 from vilp_data.locate import is_dataset
 from vilp_data.log_files import find_logs
 from vilp_data.spec import TaskSpec
@@ -81,35 +83,44 @@ def _todo(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def _check_one(path: Path, spec: TaskSpec | None) -> Checked:
-    return check_dataset(path) if is_dataset(path) else check_log(path, spec=spec)
+    """One of them looked at. What goes wrong with it is a finding: it must not cost the report on the others."""
+    kind: Literal["dataset", "log"] = "dataset" if is_dataset(path) else "log"
+    try:
+        return check_dataset(path) if kind == "dataset" else check_log(path, spec=spec)
+    except VilpDataError as error:
+        found = {"found": str(error.found)} if error.found is not None else {}
+        finding = Finding(
+            severity="error", kind="unreadable", place=Place(source=str(path)), what=error.what, evidence=found, remedy=error.remedy
+        )  # fmt: skip
+        return Checked(str(path), kind, "unreadable", (finding,))
 
 
 # --- against each other -------------------------------------------------------------------------------------------------
 
 
 def _actions(checked: Sequence[Checked]) -> tuple[list[Fit], list[Finding]]:
-    """Actions judged over every demonstration with the same topics."""
-    groups: dict[tuple[str, bool, int, int], list[tuple[str, Steps]]] = defaultdict(list)
+    """Actions judged over every demonstration with the same topics and rate."""
+    groups: list[list[tuple[str, Steps]]] = []
     for one in checked:
         if one.steps is not None:
-            groups[one.steps.shape].append((one.source, one.steps))
+            group = next((members for members in groups if members[0][1].fits(one.steps)), None)
+            if group is None:
+                groups.append(group := [])
+            group.append((one.source, one.steps))
     fits: list[Fit] = []
     findings: list[Finding] = []
-    for (topic, certain, _, _), members in groups.items():
-        stretches = [
-            Stretch(f"{source}{BETWEEN}{stretch.name}", stretch.state, stretch.action, stretch.valid)
-            for source, steps in members
-            for stretch in steps.stretches
-        ]
-        fit = fit_action(stretches)
+    for members in groups:
+        fit = fit_action([
+            replace(one, name=f"{source}{BETWEEN}{one.name}") for source, steps in members for one in steps.trajectories
+        ])  # fmt: skip
         if fit is None:
             continue
-        rate_hz = members[0][1].rate_hz
+        first = members[0][1]
         where = members[0][0] if len(members) == 1 else f"{len(members)} logs"
-        fits.append(Fit(topic if len(members) == 1 else f"{topic} ({where})", fit, rate_hz))
-        for finding in action_findings(fit, topic=topic, rate_hz=rate_hz, certain=certain):
+        fits.append(Fit(first.topic if len(members) == 1 else f"{first.topic} ({where})", fit, first.rate_hz))
+        for finding in action_findings(fit, topic=first.topic, rate_hz=first.rate_hz, certain=first.certain):
             source, _, episode = (finding.place.episode or where).partition(BETWEEN)
-            place = Place(source=source, topic=topic, episode=episode or None)
+            place = Place(source=source, topic=first.topic, episode=episode or None)
             findings.append(replace(finding, place=place))
     return fits, findings
 

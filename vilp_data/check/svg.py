@@ -10,7 +10,7 @@ from html import escape
 
 import numpy as np
 
-from vilp_data.check.action import ActionFit
+from vilp_data.check.action_fit import ActionFit
 from vilp_data.check.findings import Finding
 from vilp_data.types import F64
 
@@ -90,7 +90,7 @@ def lag_line(lag_s: F64) -> str:
 
 
 def fit_bars(fit: ActionFit) -> str:
-    """How much of the motion the action explains at each shift; the best is filled, its own step is marked."""
+    """How much of the motion the action explains at each shift; the one that drives it is filled, its own step is marked."""
     shifts = list(fit.gain)
     left, bottom, top = 8, FIT_HEIGHT - 34, 22
     step = (FIT_WIDTH - 2 * left) / len(shifts)
@@ -99,7 +99,7 @@ def fit_bars(fit: ActionFit) -> str:
         gain = min(max(fit.gain[shift], 0.0), 1.0)
         height = max((bottom - top) * gain, 1.5)
         x = left + i * step + step * 0.16
-        kind = "best" if shift == fit.best else "other"
+        kind = "best" if shift == fit.off else "other"
         middle = x + step * 0.34
         parts.append(
             f'<rect class="bar {kind}" x="{x:.1f}" y="{bottom - height:.1f}" width="{step * 0.68:.1f}" height="{height:.1f}" rx="3"/>'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 
+from vilp_data.check.action_fit import ActionFit
 from vilp_data.check.findings import Evidence, Finding, Group, grouped, verdict
 from vilp_data.check.report import Checked, Fit
 from vilp_data.check.sources import CheckReport
@@ -82,12 +83,21 @@ def shown_evidence(evidence: Evidence) -> list[tuple[str, str]]:
 
 
 def _fit_line(fit: Fit) -> str:
-    best = fit.fit.best
     shares = "  ".join(f"{shift:+d}: {max(gain, 0):.0%}" for shift, gain in fit.fit.gain.items())
-    told = "at its own step, as it should" if best == 0 else f"at {best:+d} steps"
-    if not fit.fit.shifted and best != 0:
-        told += ", too little better than its own to say more"
-    return f"{fit.topic}: of the motion that the robot's past leaves open it explains, by shift,\n        {shares}  (best {told})"
+    return f"{fit.topic}: of the motion that the robot's past leaves open it explains, by shift,\n        {shares}  ({said_of(fit.fit)})"
+
+
+def said_of(fit: ActionFit) -> str:
+    """The verdict on a fit, in a few words."""
+    if fit.off:
+        return f"stored {_steps(abs(fit.off))} {'late' if fit.off > 0 else 'early'}"
+    if fit.is_untold:
+        return "too smooth to tell one step from the next"
+    return "it drives its own step, as it should" if fit.best == 0 else "not clear enough to call it off"
+
+
+def _steps(count: int) -> str:
+    return "one step" if count == 1 else f"{count} steps"
 
 
 def json_report(report: CheckReport) -> dict[str, object]:
@@ -109,5 +119,6 @@ def _fit_dict(fit: Fit) -> dict[str, object]:
     explained = {f"{shift:+d}": gain for shift, gain in fit.fit.gain.items()}
     return {
         "topic": fit.topic, "rate_hz": fit.rate_hz, "n_steps": fit.fit.n_steps, "best_shift": fit.fit.best,
+        "verdict": said_of(fit.fit), "later_actions_add": fit.fit.later_add(0), "earlier_actions_add": fit.fit.earlier_add(0),
         "explained_by_own_past": fit.fit.own_past, "explained_by_shift": explained,
     }  # fmt: skip

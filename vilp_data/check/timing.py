@@ -65,7 +65,7 @@ TOLD = 5
 
 @dataclass(frozen=True)
 class Timing:
-    """Figures of one topic: over one stretch of a log, or joined over several.
+    """Figures of one topic: over one segment of a log, or joined over several.
 
     rate_hz, jitter  1 / median interval, and half the spread of intervals over the median; None where there is no rate
     periodic         whether there is one: else it comes on events
@@ -94,7 +94,7 @@ def header_clock(header_ns: I64 | None) -> str:
 
 
 def measure(log_ns: I64, header_ns: I64 | None) -> Timing:
-    """The figures of a stretch: log times int64 [n] ascending, header stamps [n] in the same order or None."""
+    """The figures of a segment: log times int64 [n] ascending, header stamps [n] in the same order or None."""
     clock = header_clock(header_ns)
     has_clock = header_ns is not None and clock in ("wall", "simulated")
     stamps = np.sort(header_ns) if has_clock and header_ns is not None else log_ns
@@ -113,7 +113,7 @@ def measure(log_ns: I64, header_ns: I64 | None) -> Timing:
 
 
 def joined(one: Timing | None, other: Timing) -> Timing:
-    """The figures of two stretches of one topic together: medians weighted by messages."""
+    """The figures of two segments of one topic together: medians weighted by messages."""
     if one is None:
         return other
     n = one.n_messages + other.n_messages
@@ -138,7 +138,7 @@ def joined(one: Timing | None, other: Timing) -> Timing:
 def timing_findings(
     topic: str, log_ns: I64, header_ns: I64 | None, *, origin_ns: int, camera: bool = False, matters: bool = True
 ) -> Iterator[Finding]:
-    """What is wrong with a stretch of one topic's stamps, as `measure` takes them. Places count seconds from `origin_ns`, by log time.
+    """What is wrong with a segment of one topic's stamps, as `measure` takes them. Places count seconds from `origin_ns`, by log time.
 
     Of commands, which come when there is something to command, and of topics that no task is likely to read, nothing `matters`: all is
     but a note."""

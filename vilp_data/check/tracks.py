@@ -1,6 +1,6 @@
-"""One topic of a log while it is read: stamps, numbers and a few images, kept until the stretch they belong to is judged.
+"""One topic of a log while it is read: stamps, numbers and a few images, kept until the segment they belong to is judged.
 
-Memory is bounded by the stretch, not by the log: `taken` hands out what was gathered and forgets it.
+Memory is bounded by the segment, not by the log: `taken` hands out what was gathered and forgets it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vilp_data import geometry
-from vilp_data.check.cameras import SAMPLE_HZ, Glance, glance
+from vilp_data.check.cameras import SAMPLE_HZ, FrameSample, sample_frame
 from vilp_data.check.columns import Columns, columns_of, stamp_reader
 from vilp_data.check.pictures import PictureReader, is_camera
 from vilp_data.errors import DecodeError
@@ -33,19 +33,19 @@ GIVE_UP = 3
 
 
 @dataclass(frozen=True)
-class Gathered:
-    """What a stretch gathered of one topic.
+class TopicSamples:
+    """What a segment gathered of one topic.
 
     log_ns     int64 [n]; header_ns int64 [n] or None where messages carry no stamp
     row_index  int64 [m]: which of the n messages each row of numbers is from; rows float64 [m,D]
-    glances    sampled images, their times in seconds of log time since the start of the demonstration
+    samples    sampled images, their times in seconds of log time since the start of the demonstration
     """
 
     log_ns: I64
     header_ns: I64 | None
     row_index: I64
     rows: F64
-    glances: list[Glance]
+    samples: list[FrameSample]
 
 
 @dataclass
@@ -59,14 +59,14 @@ class Track:
     n_undecoded: int = 0
     n_sampled: int = 0
     odd_rows: int = 0  # messages whose numbers were of another shape than the first one's
-    seen: list[Glance] = field(default_factory=list)  # every sampled image of this demonstration
+    seen: list[FrameSample] = field(default_factory=list)  # every sampled image of this demonstration
     pictures: list[tuple[int, U8]] = field(default_factory=list)  # log time, picture
     _stamp: Callable[[Message], int] | None = None
     _log: array[int] = field(default_factory=lambda: array("q"))
     _header: array[int] = field(default_factory=lambda: array("q"))
     _index: array[int] = field(default_factory=lambda: array("q"))
     _values: array[float] = field(default_factory=lambda: array("d"))
-    _glances: list[Glance] = field(default_factory=list)
+    _samples: list[FrameSample] = field(default_factory=list)
     _next_sample_ns: int = 0
     _next_row_ns: int = 0
     _next_picture_ns: int = 0
@@ -107,18 +107,18 @@ class Track:
         """How many numbers are kept at present."""
         return len(self._log) + len(self._header) + len(self._values)
 
-    def taken(self) -> Gathered:
+    def taken(self) -> TopicSamples:
         """What was gathered since the last call."""
         width = len(self.columns.names) if self.columns else 0
-        gathered = Gathered(
+        gathered = TopicSamples(
             np.array(self._log, np.int64),
             np.array(self._header, np.int64) if self._stamp is not None else None,
             np.array(self._index, np.int64),
             np.array(self._values, np.float64).reshape(-1, width) if width else np.empty((0, 0)),
-            self._glances,
+            self._samples,
         )
         self._log, self._header, self._index = array("q"), array("q"), array("q")
-        self._values, self._glances = array("d"), []
+        self._values, self._samples = array("d"), []
         return gathered
 
     def _look_at_first(self, message: Message) -> None:
@@ -162,8 +162,8 @@ class Track:
         if frame is None:
             return
         self.n_sampled += 1
-        seen = glance(frame, (message.log_time_ns - self._origin_ns) / 1e9)
-        self._glances.append(seen)
+        seen = sample_frame(frame, (message.log_time_ns - self._origin_ns) / 1e9)
+        self._samples.append(seen)
         self.seen.append(seen)
         if self._picture_step_ns is not None and message.log_time_ns >= self._next_picture_ns:
             self._next_picture_ns = message.log_time_ns + self._picture_step_ns - period_ns // 2
@@ -180,7 +180,7 @@ def picture_of(frame: U8) -> U8:
     return small if small.ndim == 3 else small[..., None]
 
 
-def runs_on_header(gathered: Gathered) -> bool:
+def runs_on_header(gathered: TopicSamples) -> bool:
     """Whether header stamps tell when things happened: set, in order, and on the recorder's clock."""
     header = gathered.header_ns
     if header is None or not len(header) or not header.all():

@@ -39,21 +39,23 @@ def check(
     Example: vilp-data check bags/ --html check.html
     """
     from vilp_data.check.findings import counts
-    from vilp_data.check.page import write_page
+    from vilp_data.check.page import require_place, write_page
     from vilp_data.check.sources import check_sources
     from vilp_data.check.text import format_report, json_report
 
+    if html is not None:
+        require_place(html)
     paths = targets or [open_dataset(None)[0]]
     spec = load_task(task) if task else None
     started = time.monotonic()
     with progress_bar("checking", None) as advance:
         report = check_sources(paths, spec=spec, workers=workers or cpu_count(), progress=advance)
-    if html is not None:
-        write_page(html, report)
     if as_json:
         print_json(json_report(report))
     else:
         print(format_report(report))
+    if html is not None:  # after it: a full disk must not cost what was found
+        write_page(html, report)
     console.print(
         f"checked in {time.monotonic() - started:.1f} s" + (f"; page: {html}" if html else ""), highlight=False
     )

@@ -42,7 +42,7 @@ def split(
         findings = check_dataset_split(root)
         print_json(findings) if as_json else print("\n".join(findings) or f"{lock_path(root)}: nothing wrong")
         raise typer.Exit(1 if findings else 0)
-    kept = find_split(root) is not None and not redraw
+    kept = not redraw and find_split(root) is not None
     lock = update_split(
         root,
         ratio=spec.split.ratio if ratio is None else ratio,

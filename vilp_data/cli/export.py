@@ -86,9 +86,12 @@ def card(
         ),
     ] = None,
     licence: LicenceOption = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a page that somebody wrote.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write a dataset's card: what is in it, its split, statistics and sources, and a contact sheet.
+
+    An earlier card is replaced; a page that somebody wrote is not.
 
     Example: vilp-data card data/pusht -o pusht.md --licence MIT
     """
@@ -97,7 +100,7 @@ def card(
 
     root, _ = open_dataset(dataset)
     path = out or root / "README.md"
-    sheet = write_card(EpisodeStore(root), path, licence=licence)
+    sheet = write_card(EpisodeStore(root), path, licence=licence, force=force)
     print_json({"card": path, "contact_sheet": sheet}) if as_json else print(f"{path}\n{sheet}")
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from vilp_data.cli.options import DatasetArgument, JsonOption, open_dataset, print_json
+from vilp_data.dataset_state import DatasetState, read_state
 from vilp_data.errors import UsageError
+from vilp_data.history import HistoryEntry
 from vilp_data.locate import find_dataset, is_dataset
-from vilp_data.surgery.dataset_state import DatasetState, read_state
 from vilp_data.surgery.garbage import KEEP
 from vilp_data.surgery.state_diff import StateDiff, compare_states
 
@@ -26,13 +28,26 @@ def log(dataset: DatasetArgument = None, as_json: JsonOption = False) -> None:
 
     Example: vilp-data log data/hanoi
     """
-    from vilp_data.surgery.history import read_history
+    from vilp_data.history import read_history
 
     root, _ = open_dataset(dataset)
-    entries = read_history(root)
+    damaged: list[str] = []
+    entries = read_history(root, damaged)
     if as_json:
-        print_json([{name: value for name, value in vars(entry).items() if name != "state"} for entry in entries])
-        return
+        print_json([_without_files(entry) for entry in entries])
+    else:
+        _print_log(root, entries)
+    for message in damaged:
+        print(message, file=sys.stderr)
+    if damaged:
+        raise typer.Exit(1)
+
+
+def _without_files(entry: HistoryEntry) -> dict[str, Any]:
+    return {name: value for name, value in vars(entry).items() if name not in ("state", "touched")}
+
+
+def _print_log(root: Path, entries: list[HistoryEntry]) -> None:
     undone = {entry.undoes: entry.number for entry in entries if entry.undoes is not None}
     if not entries:
         print(f"{root}: no history yet; it begins with the next command that changes something")
@@ -87,6 +102,8 @@ def undo(
 ) -> None:
     """Take back the last operation, exactly: every file is again what it was. Again takes back the one before.
 
+    An undo is an operation too: with its number, --operation brings again what it took.
+
     Example: vilp-data undo data/hanoi
     """
     from vilp_data.surgery.undo import undo as take_back
@@ -94,9 +111,10 @@ def undo(
     root, _ = open_dataset(dataset)
     entry = take_back(root, operation)
     if as_json:
-        print_json({name: value for name, value in vars(entry).items() if name != "state"})
+        print_json(_without_files(entry))
     else:
         print(f"{root}: {entry.note}; {entry.n_episodes} episodes, {entry.n_steps} steps")
+        print(f"  `vilp-data undo {root} --operation {entry.number}` takes that back in turn")
 
 
 def gc(
@@ -141,9 +159,12 @@ def gc(
 
 def _state(given: str | None, data: Path | None, default: str) -> DatasetState:
     """The state that an argument of `diff` names."""
-    from vilp_data.surgery.history import numbers, state_after
-    from vilp_data.surgery.journal import await_settled
+    from vilp_data.history import numbers, state_after
+    from vilp_data.writer_lock import await_settled
 
+    if given is not None and given.isdigit() and is_dataset(Path(given)):
+        remedy = f"./{given} for the dataset, 0{given} for the operation"
+        raise UsageError("both a dataset here and the number of an operation", where=given, remedy=remedy)
     if given is not None and not given.isdigit():
         if not is_dataset(Path(given)):
             remedy = "a dataset folder, or the number of an operation as `vilp-data log` lists them"

@@ -13,8 +13,10 @@ from vilp_data.cli.cuts import cuts_as_data, print_cuts
 from vilp_data.cli.options import JsonOption, PresetOption, TaskOption, WorkersOption, console, print_json, progress_bar
 from vilp_data.engine import cpu_count
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import UsageError
+from vilp_data.errors import UsageError, some_of
 from vilp_data.locate import default_root, find_dataset, remember
+from vilp_data.log_files import find_logs, is_one_log
+from vilp_data.sources.rosbag2_metadata import is_bag_folder
 from vilp_data.spec import TaskSpec, load_task
 
 FULL_FAILURES = 3  # of the same kind, said in full
@@ -82,6 +84,7 @@ def inspect(
     """
     from vilp_data.log_summary import format_summary, summarise
 
+    log = _one_log(log)
     if suggest_spec:
         _write_suggestion(log, out)
         return
@@ -96,6 +99,24 @@ def inspect(
     if task is not None:
         print()
         print_cuts([log], load_task(task), as_json=False)
+
+
+def _one_log(path: Path) -> Path:
+    """The log at a path, or the only one in a plain folder. UsageError where a folder holds others, with their names."""
+    if not path.is_dir() or is_one_log(path) or is_bag_folder(path):
+        return path
+    found = find_logs([path])
+    if len(found.logs) == 1 and not found.passed_over:
+        return found.logs[0]
+    names = some_of([str(log.relative_to(path)) for log in found.logs], 8)
+    if found.passed_over:
+        names += f"; not read: {some_of([str(other.relative_to(path)) for other in found.passed_over], 8)}"
+    raise UsageError(
+        "a folder of logs, not one log",
+        where=path,
+        found=names,
+        remedy=f"`vilp-data inspect {found.logs[0]}`, or `vilp-data check {path}` for all of them",
+    )
 
 
 def _write_suggestion(log: Path, out: Path | None) -> None:
@@ -173,8 +194,10 @@ def ingest(
             print(f"  {stay} removed on purpose before, and left out: {listed}; --again takes them")
         if report.replaced:
             print(f"  replaced, since their log changed: {', '.join(report.replaced)}")
+        if report.restated:
+            print(f"  told otherwise by the task now, their labels brought up to date: {', '.join(report.restated)}")
         if report.passed_over:
-            print(f"  passed over, of formats that are not read yet: {', '.join(report.passed_over)}")
+            print(f"  passed over, recordings left open and links that lead nowhere: {', '.join(report.passed_over)}")
         for note in report.notes:
             print(f"  {note}")
         for episode, findings in sorted(report.findings.items()):
@@ -187,8 +210,8 @@ def ingest(
 
 
 def _failures(failed: list[tuple[str, str]]) -> list[str]:
-    """Every failure in full; of more than FULL_FAILURES that end in the same words, the first ones and the others' names: a dataset
-    that was fetched in part lacks files by the hundred."""
+    """Every failure in full; of more than FULL_FAILURES that end in the same words, the first ones, a few of the others' names and how
+    many more: a dataset that was fetched in part lacks files by the hundred."""
     alike: dict[str, list[tuple[str, str]]] = {}
     for name, message in failed:
         alike.setdefault(message.partition("\n")[0].rpartition(": ")[2], []).append((name, message))
@@ -196,7 +219,7 @@ def _failures(failed: list[tuple[str, str]]) -> list[str]:
     for what, group in alike.items():
         lines += [f"  {name}: {message}" for name, message in group[:FULL_FAILURES]]
         if rest := [name for name, _ in group[FULL_FAILURES:]]:
-            lines.append(f"  {len(rest)} more, {what} (--json has all): {', '.join(rest)}")
+            lines.append(f"  {len(rest)} more, {what}: {some_of(rest, FULL_FAILURES)} (--json has all)")
     return lines
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,10 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, sort_keys=True, default=str))
 
 
+LINE_EVERY_S = 30.0
+"""Seconds between two lines of progress where there is no terminal."""
+
+
 class Advance(Protocol):
     """Moves a bar to `done`; `total` where it was not known before."""
 
@@ -53,7 +58,7 @@ class Advance(Protocol):
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Advance]:
-    """A bar with count, rate and time left, on a terminal; elsewhere nothing."""
+    """A bar with count, rate and time left on a terminal; elsewhere a line now and then, so that a log shows that work goes on."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -65,7 +70,13 @@ def progress_bar(label: str, total: int | None) -> Iterator[Advance]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=total, rate="")
 
+        said = time.monotonic()
+
         def advance(done: int, total: int | None = None) -> None:
+            nonlocal said
+            if not console.is_terminal and time.monotonic() - said >= LINE_EVERY_S:
+                said = time.monotonic()
+                console.print(f"{label}: {done}" + (f" of {total}" if total else ""), highlight=False)
             speed = bar.tasks[task].speed
             bar.update(task, completed=done, total=total, rate=f"{speed:.2f}/s" if speed else "")
 

@@ -104,6 +104,9 @@ def relabel(
     unset: Annotated[
         list[str] | None, typer.Option(help="A tag to take away; may be given several times.", show_default=False)
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Also where the split no longer fits them, and has to be drawn anew.")
+    ] = False,
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -114,7 +117,7 @@ def relabel(
     from vilp_data.surgery.operations import relabel_episodes
 
     root, _ = open_dataset(data)
-    report = relabel_episodes(root, episodes, labels=_pairs(labels or [], outcome), unset=unset or ())
+    report = relabel_episodes(root, episodes, labels=_pairs(labels or [], outcome), unset=unset or (), force=force)
     if as_json:
         print_json(dataclasses.asdict(report))
         return

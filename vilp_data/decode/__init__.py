@@ -27,6 +27,9 @@ __all__ = [
 EARLIEST_WALL_NS = 946_684_800 * 10**9
 """The year 2000. Earlier stamps are simulated time, or come from a clock that was never set."""
 
+FARTHEST_NS = 1 << 62
+"""A century and a half from 1970. Stamps beyond are garbage."""
+
 
 def is_wall_clock(time_ns: int) -> bool:
     """Whether a time is one of the wall clock, as far as its value tells."""
@@ -36,7 +39,8 @@ def is_wall_clock(time_ns: int) -> bool:
 def header_time_ns(message: Message) -> int | None:
     """The time a message gives itself, in nanoseconds: ROS `header.stamp`, or `timestamp` as Foxglove's schemas have it; else None.
 
-    A stamp of zero is returned as zero: many drivers leave it unset, and a simulator starts there."""
+    A stamp of zero is returned as zero: many drivers leave it unset, and a simulator starts there. One that lies centuries away is
+    none: it would not even fit the integers that times are kept in."""
     body = message.body
     stamp = member(member(body, "header", None), "stamp", None)
     if stamp is None:
@@ -53,4 +57,5 @@ def header_time_ns(message: Message) -> int | None:
     nanoseconds = first_member(stamp, ("nanosec", "nsec", "nanos"))
     if not isinstance(seconds, int) or not isinstance(nanoseconds, int):
         return None
-    return seconds * 1_000_000_000 + nanoseconds
+    time_ns = seconds * 1_000_000_000 + nanoseconds
+    return time_ns if abs(time_ns) < FARTHEST_NS else None

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from vilp_data.decode.image_file import PNG_START, image_file
 from vilp_data.decode.images import (
     COMPRESSED_IMAGES,
+    FLOATS,
     GREY16,
     RAW_IMAGES,
     array_pixels,
@@ -29,6 +30,7 @@ from vilp_data.decode.images import (
 )
 from vilp_data.decode.message_body import cannot_decode
 from vilp_data.decode.rvl import unpack_rvl
+from vilp_data.errors import DecodeError
 from vilp_data.spec import DepthSpec
 from vilp_data.types import F32, U8, Message
 
@@ -36,16 +38,32 @@ METRES = {"mm": 1e-3, "m": 1.0}
 LEVELS = 254
 """Steps between the level of near_m, 1, and that of far_m, 255."""
 
-RAW_DEPTH: dict[str, np.dtype[Any]] = {**dict.fromkeys(GREY16, np.dtype(np.uint16)), "32FC1": np.dtype(np.float32)}
+RAW_DEPTH: dict[str, np.dtype[Any]] = {**dict.fromkeys(GREY16, np.dtype(np.uint16)), FLOATS: np.dtype(np.float32)}
+MEASURES = ("16UC1", FLOATS)
 COMPRESSED_DEPTH = "compressedDepth"
 _HEAD = struct.Struct("<iff")  # the transport's own head: a format number, then the two numbers of its inverse coding
 
 
 def is_depth(message: Message) -> bool:
     """Whether a message surely measures, by what it says of itself: an encoding that no picture has."""
+    encoding = image_encoding(message)
     if message.schema in RAW_IMAGES:
-        return image_encoding(message) in RAW_DEPTH
-    return message.schema in COMPRESSED_IMAGES and COMPRESSED_DEPTH in image_encoding(message)
+        return encoding in MEASURES
+    return message.schema in COMPRESSED_IMAGES and (COMPRESSED_DEPTH in encoding or encoding.startswith(MEASURES))
+
+
+def is_grey16(message: Message) -> bool:
+    """Whether a message holds grey of 16 bits that may be either, depth or a picture (thermal, infrared): mono16, or a PNG that does
+    not say."""
+    if message.schema in RAW_IMAGES:
+        return image_encoding(message) == "mono16"
+    if message.schema not in COMPRESSED_IMAGES or is_depth(message):
+        return False
+    try:
+        head = image_file(payload(message).tobytes())
+    except DecodeError:
+        return False
+    return head is not None and head.bits == 16 and head.grey
 
 
 def decode_depth(message: Message, depth: DepthSpec) -> F32:

@@ -1,4 +1,5 @@
-"""Paths into a message: "pose.position.x", "position[0:7]", "joints[2].effort", "[0:2]" for a bare array. Pure.
+"""Paths into a message: "pose.position.x", "position[0:7]", "joints[2].effort", "[0:2]" for a bare array, "points[-1]" for the
+last of a list. Pure.
 
 A path may begin with `msg.`, as message definitions and plotting tools have it: "msg.position[0:7]" is "position[0:7]".
 """
@@ -15,10 +16,10 @@ import numpy as np
 from vilp_data.decode.message_body import cannot_decode, member_names, require_member
 from vilp_data.decode.numeric_fields import numeric_paths
 from vilp_data.decode.usual_fields import usual_fields
-from vilp_data.errors import DecodeError, nearest
+from vilp_data.errors import DecodeError, nearest, some_of
 from vilp_data.types import Message
 
-_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)(?::(\d+))?\]")
+_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)(?::(\d+))?\]")
 WHOLE = "msg"
 SHOWN_PATHS = 24
 
@@ -72,10 +73,7 @@ def follow(message: Message, path: str) -> Any:
 def fields_here(message: Message) -> str:
     """The numeric fields of a message, to be shown to whoever named none, or a wrong one."""
     paths = numeric_paths(message.body)
-    shown = ", ".join(paths[:SHOWN_PATHS]) + (
-        f" and {len(paths) - SHOWN_PATHS} more" if len(paths) > SHOWN_PATHS else ""
-    )
-    return shown or "(no numbers)"
+    return some_of(paths, SHOWN_PATHS) or "(no numbers)"
 
 
 def _no_member(message: Message, path: str, name: str, value: Any) -> DecodeError:
@@ -100,9 +98,12 @@ def _item(message: Message, path: str, value: Any, step: int | slice) -> Any:
             message, f"field {path!r}: only lists and arrays have items", found, "leave the brackets out"
         )
     length = len(value)
-    last = step.stop if isinstance(step, slice) else step + 1
-    if last > length or (isinstance(step, slice) and step.start >= step.stop):
+    if not _is_inside(step, length):
         raise cannot_decode(
             message, f"field {path!r} reaches outside its list", f"{length} values", f"use indices within [0:{length}]"
         )
     return value[step]
+
+
+def _is_inside(step: int | slice, length: int) -> bool:
+    return 0 <= step.start < step.stop <= length if isinstance(step, slice) else -length <= step < length

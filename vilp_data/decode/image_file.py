@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 RIFF, WEBP = b"RIFF", b"WEBP"
 _TAIL = 4096  # where an end mark is looked for first
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers whose segment gives the size
+_JPEG_SCAN = 0xDA
 _PNG_GREY = frozenset({0, 4})
 
 
@@ -38,26 +40,29 @@ def image_file(data: bytes) -> ImageFile | None:
 
 
 def _png(data: bytes) -> ImageFile:
+    """Chunk after chunk up to the end mark: a decoder allocates the length that a chunk claims, though the file has no such bytes."""
     # signature, then IHDR: length, name, width, height, bit depth, colour type
     width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     bits, colour = (data[24], data[25]) if len(data) > 25 else (8, 2)
-    return ImageFile("png", height, width, bits, PNG_END in data[-_TAIL:], grey=colour in _PNG_GREY)
+    place = len(PNG_START)
+    while place + 12 <= len(data) and data[place + 4 : place + 8] != PNG_END:  # length, name, data, checksum
+        place += 12 + int.from_bytes(data[place : place + 4], "big")
+    return ImageFile("png", height, width, bits, place + 12 <= len(data), grey=colour in _PNG_GREY)
 
 
 def _jpeg(data: bytes) -> ImageFile:
-    whole = JPEG_END in data[-_TAIL:] or JPEG_END in data
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
+    """Segment after segment up to the first scan: the end mark is looked for behind it, for a thumbnail among the segments has one
+    of its own."""
+    height = width = 0
+    bits, place = 8, 2
+    while place + 9 <= len(data) and data[place] == 0xFF and (marker := data[place + 1]) != _JPEG_SCAN:
         if marker in _JPEG_FRAMES:  # length, precision, height, width
-            height, width = (
-                int.from_bytes(data[place + 5 : place + 7], "big"),
-                int.from_bytes(data[place + 7 : place + 9], "big"),
-            )
-            return ImageFile("jpeg", height, width, data[place + 4], whole)
+            bits, height, width = data[place + 4], *struct.unpack_from(">HH", data, place + 5)
         filler = marker == 0xFF
         place += 1 if filler else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-    return ImageFile("jpeg", 0, 0, 8, whole)
+    scan = data.find(bytes((0xFF, _JPEG_SCAN)), place)
+    whole = scan >= 0 and (data.find(JPEG_END, max(scan, len(data) - _TAIL)) >= 0 or data.find(JPEG_END, scan) >= 0)
+    return ImageFile("jpeg", height, width, bits, whole)
 
 
 def _webp(data: bytes) -> ImageFile:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from vilp_data import limits
 from vilp_data.decode.image_file import ImageFile, image_file
-from vilp_data.decode.message_body import cannot_decode, member
+from vilp_data.decode.message_body import cannot_decode, member, shown, whole_number
 from vilp_data.errors import DecodeError
 from vilp_data.types import U8, Message
 
@@ -46,7 +45,7 @@ PAIRED = {
 }
 CHANNELS = PLAIN | dict.fromkeys(MOSAICS, 1) | dict.fromkeys(PAIRED, 2)
 GREY16 = frozenset({"mono16", "16UC1"})
-DEPTH = GREY16 | {"32FC1"}
+FLOATS = "32FC1"
 WHOLE = 1e-3  # how far a float pixel may lie from a whole number
 
 Levels = tuple[int, int]
@@ -68,19 +67,20 @@ def is_image(message: Message) -> bool:
     return message.schema in RAW_IMAGES or message.schema in COMPRESSED_IMAGES
 
 
-def decode_image(message: Message, *, levels: Levels | None = None) -> U8:
+def decode_image(message: Message, *, levels: Levels | None = None, dark: bool = False) -> U8:
     """The image in a message as uint8 [H,W,3], RGB, top row first.
 
     Raw images in rgb8, bgr8, rgba8, bgra8 (alpha dropped), mono8 and 8UC1 (repeated), 8-bit Bayer mosaics (bilinear), YUV 4:2:2;
     JPEG, PNG and WebP (of colour PNGs of 16 bits the upper 8), EXIF orientation ignored; arrays [H,W,3] of uint8, or of floats
     that hold whole numbers 0 to 255. Grey of 16 bits (mono16, 16UC1, PNG) only with `levels`, and then nothing else.
-    Anything else is a DecodeError, never a guess."""
+    A float image without anything above 1 may be a dark one, or count from 0 to 1: it is read only if `dark` is set, by whoever sees
+    to it that others of the topic are brighter. Anything else is a DecodeError, never a guess."""
     if message.schema in COMPRESSED_IMAGES:
         return _compressed_image(message, levels)
     if message.schema in RAW_IMAGES:
         return _raw_image(message, levels)
     if message.schema == "array" and levels is None:
-        return _array_image(message)
+        return _array_image(message, dark)
     if message.schema == "array":
         return _spread(message, array_pixels(message), levels)
     known = sorted(RAW_IMAGES | COMPRESSED_IMAGES)
@@ -129,9 +129,9 @@ def raw_pixels(message: Message, dtypes: Mapping[str, np.dtype[Any]]) -> npt.NDA
             message, "the view's table does not fit its images", found, "take `depth` or `levels` out of it"
         )
     dtype, channels = dtypes[encoding], CHANNELS.get(encoding, 1)
-    height, width = int(member(body, "height", 0)), int(member(body, "width", 0))
+    height, width, step = (whole_number(member(body, name, 0), message, name) for name in ("height", "width", "step"))
     row_bytes = width * channels * dtype.itemsize
-    step = int(member(body, "step", 0)) or row_bytes
+    step = step or row_bytes
     data = payload(message)
     # The last row may come without its padding.
     if min(height, width) < 1 or step < row_bytes or len(data) < step * (height - 1) + row_bytes:
@@ -154,7 +154,7 @@ def _way_out(encoding: str) -> str:
     """What to do about an encoding that is not read, in a log that is recorded already."""
     if encoding in GREY16:
         return NOT_A_PICTURE
-    if encoding in DEPTH:
+    if encoding == FLOATS:
         return "a depth image, not a picture: give the view `depth = { unit, near_m, far_m }`, or leave the topic out"
     if encoding == "8UC3":
         return "8UC3 does not say whether red or blue comes first: rewrite the topic's `encoding` as rgb8 or bgr8"
@@ -245,15 +245,15 @@ def array_pixels(message: Message) -> npt.NDArray[Any]:
     pixels = np.asarray(message.body)
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         return pixels[..., 0]
-    if pixels.ndim != 2:
+    if pixels.ndim != 2 or not pixels.size:
         remedy = "take `depth` or `levels` out of the view's table"
         raise cannot_decode(message, "an array that is not of one channel", f"shape {pixels.shape}", remedy)
     return pixels
 
 
-def _array_image(message: Message) -> U8:
+def _array_image(message: Message, dark: bool) -> U8:
     pixels = np.asarray(message.body)
-    if pixels.ndim != 3 or pixels.shape[2] != 3:
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         hint = "; channels come last" if pixels.ndim == 3 and pixels.shape[0] == 3 else ""
         raise cannot_decode(
             message, "an image array must be [height, width, 3]", f"shape {pixels.shape}", f"reshape it{hint}"
@@ -264,14 +264,10 @@ def _array_image(message: Message) -> U8:
         raise cannot_decode(message, "an image array must be uint8 or float", str(pixels.dtype), "store uint8")
     whole = np.rint(pixels)
     low, high = float(pixels.min()), float(pixels.max())
-    if 0.0 < high <= 1.0 and low >= 0.0:
-        raise cannot_decode(
-            message,
-            "a float image in the range 0 to 1",
-            f"values {low:g} to {high:g}",
-            "store 0 to 255, rounded, as uint8 or float",
-        )
-    if not (low >= -WHOLE and high <= 255 + WHOLE and float(np.abs(pixels - whole).max()) <= WHOLE):
+    is_whole = low >= -WHOLE and high <= 255 + WHOLE and float(np.abs(pixels - whole).max()) <= WHOLE
+    if 0.0 < high <= 1.0 and low >= 0.0 and not (dark and is_whole):
+        raise range_of_one(message.topic, f"at {message.log_time_ns} ns, values {low:g} to {high:g}")
+    if not is_whole:
         remedy = "store whole numbers 0 to 255 (rounding here would hide a wrong scale)"
         raise cannot_decode(
             message, "a float image that does not hold whole numbers 0 to 255", f"values {low:g} to {high:g}", remedy
@@ -279,18 +275,39 @@ def _array_image(message: Message) -> U8:
     return np.asarray(whole, np.uint8)
 
 
+def range_of_one(topic: str, found: str) -> DecodeError:
+    """The error for float images that seem to count from 0 to 1."""
+    remedy = "store 0 to 255, rounded, as uint8 or float"
+    return DecodeError("a float image in the range 0 to 1", where=topic, found=found, remedy=remedy)
+
+
 def payload(message: Message) -> U8:
-    """The `data` field as uint8 [n]: bytes, an array, a list of numbers, or base64 in JSON."""
+    """The `data` field as uint8 [n]: bytes, an array, a list of whole numbers 0 to 255, or base64 in JSON."""
     data = member(message.body, "data", None)
     if isinstance(data, str):
         try:
             data = base64.b64decode(data, validate=True)
-        except binascii.Error as error:
+        except ValueError as error:  # also of text that is not ASCII
             raise cannot_decode(
                 message, "image data that is not base64", str(error), "JSON images hold their bytes in base64"
             ) from error
     if isinstance(data, (bytes, bytearray, memoryview)):
         return np.frombuffer(data, np.uint8)
-    if data is None or np.ndim(data) != 1:
+    if data is None or isinstance(data, (dict, bool, int, float)):
         raise cannot_decode(message, "an image without data", type(data).__name__, "the message needs a field `data`")
-    return np.ascontiguousarray(data, np.uint8)
+    return _bytes_of(data, message)
+
+
+def _bytes_of(numbers: Any, message: Message) -> U8:
+    """A list or array of numbers as uint8 [n]; DecodeError where one of them is no byte, rather than what casting makes of it."""
+    try:
+        array = np.asarray(numbers)
+        with np.errstate(invalid="ignore"):
+            in_bytes = array.astype(np.uint8, copy=False)
+        is_bytes = array.ndim == 1 and (array.dtype == np.uint8 or np.array_equal(in_bytes, array))
+    except (TypeError, ValueError, OverflowError):  # text, lists of several lengths, integers beyond 64 bits
+        is_bytes = False
+    if not is_bytes:
+        remedy = "the message's `data` must be bytes, or whole numbers 0 to 255"
+        raise cannot_decode(message, "image data that is no bytes", shown(numbers), remedy)
+    return np.ascontiguousarray(in_bytes)

@@ -9,6 +9,9 @@ from typing import Any
 from vilp_data.errors import DecodeError
 from vilp_data.types import Message
 
+SHOWN_CHARACTERS = 60
+DAMAGED = "the recorder wrote a damaged message; leave the topic out"
+
 
 def member(value: Any, name: str, default: Any = None) -> Any:
     """A member by name, `default` where there is none."""
@@ -59,6 +62,30 @@ def set_members(value: Any) -> Iterator[tuple[str, Any]]:
 def _is_unset(value: Any, name: str) -> bool:
     descriptor = getattr(value, "DESCRIPTOR", None)
     return descriptor is not None and descriptor.fields_by_name[name].has_presence and not value.HasField(name)
+
+
+def number(value: Any, message: Message, field: str) -> float:
+    """A member's value as a float: a number, or text that reads as one, which is how JSON has 64-bit integers and "NaN".
+
+    DecodeError naming the field for anything else (null, a list, an object, an integer beyond the floats)."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise cannot_decode(message, f"{field} is no number", shown(value), DAMAGED) from error
+
+
+def whole_number(value: Any, message: Message, field: str) -> int:
+    """The same of a size or a count: DecodeError for what is not whole too."""
+    found = number(value, message, field)
+    if not found.is_integer():
+        raise cannot_decode(message, f"{field} is no whole number", shown(value), DAMAGED)
+    return int(found)
+
+
+def shown(value: Any) -> str:
+    """A value for an error's `found`, cut where it is long."""
+    text = "null" if value is None else repr(value)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}…"
 
 
 def cannot_decode(message: Message, what: str, found: str | None, remedy: str) -> DecodeError:

@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vilp_data.decode.message_body import member_names, set_members
 from vilp_data.decode.usual_fields import PARTS_OF
-from vilp_data.types import Message
+from vilp_data.types import F64, Message
 
 LARGEST_VECTOR = 32
 """Longer arrays are images, scans or matrices rather than something to plot."""
 
 MAX_DEPTH = 8
-STAMPS = frozenset({"header", "timestamp", "stamp"})
+ABOUT = frozenset({"header", "timestamp", "stamp", "layout"})
+"""Members that tell of a message what it holds, stamps and a MultiArray's layout, and are nothing to plot."""
 ITEM_NAMES = ("name", "child_frame_id", "id")
 
 Series = dict[str, dict[str, float]]
 """Group -> name of the series -> value: {"position": {"elbow": 0.1}}, {"pose.position": {"x": 0.3, "y": …}}."""
+
+
+def as_numbers(value: Any) -> F64 | None:
+    """A number, or a list or an array of numbers, as float64 of its own shape; None for anything else."""
+    try:
+        array: npt.NDArray[Any] = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        return None
+    return array.astype(np.float64) if array.dtype.kind in "fiub" else None
 
 
 def numeric_series(message: Message) -> Series:
@@ -60,7 +72,7 @@ def _paths(value: Any, path: str, depth: int) -> Iterator[str]:
             yield path
             return
         for name, inside in set_members(value):
-            if name not in STAMPS:
+            if name not in ABOUT:
                 yield from _paths(inside, f"{path}.{name}" if path else name, depth + 1)
 
 
@@ -68,14 +80,15 @@ def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
     if len(path) > MAX_DEPTH:
         return
     if isinstance(value, bool | int | float | np.number | np.bool_):
-        yield path or ("value",), float(value)
+        with suppress(OverflowError):  # JSON has whole numbers of any length
+            yield path or ("value",), float(value)
     elif isinstance(value, np.ndarray) or _is_list(value):
         yield from _list_leaves(value, path, ())
     else:
         fields = dict(set_members(value))
         names = _texts(fields.get("name"))
         for name, inside in fields.items():
-            if name in STAMPS:
+            if name in ABOUT:
                 continue
             if isinstance(inside, np.ndarray) or _is_list(inside):
                 yield from _list_leaves(inside, (*path, name), names)
@@ -102,10 +115,8 @@ def _list_leaves(values: Any, path: tuple[str, ...], names: Sequence[str]) -> It
 
 def _numbers(values: Any) -> list[float] | None:
     """The values of a flat list or array of numbers; None for anything else."""
-    if not isinstance(values, np.ndarray) and not all(isinstance(value, bool | int | float) for value in values):
-        return None
-    array = np.asarray(values)
-    return array.astype(np.float64).tolist() if array.ndim == 1 and array.dtype.kind in "fiub" else None
+    array = as_numbers(values)
+    return array.tolist() if array is not None and array.ndim == 1 else None
 
 
 def _is_list(value: Any) -> bool:

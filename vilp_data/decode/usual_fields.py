@@ -1,19 +1,25 @@
 """What a message's vector is where the task names no fields: the usual numbers of the schemas that robots write. Pure.
 
 Poses and transforms are seven numbers, position then quaternion x y z w; twists, accelerations and wrenches six. Odometry is its pose
-alone: its twist is the field `twist.twist`. Covariances, times and identifiers are never among the usual numbers.
+alone: its twist is the field `twist.twist`. Covariances, times and identifiers are never among the usual numbers, and of a
+trajectory with several points nobody but the user knows which one is meant.
 """
 
 from __future__ import annotations
 
+ROTATION = ("x", "y", "z", "w")
+
 PARTS_OF: dict[frozenset[str], tuple[str, ...]] = {
     frozenset(parts): parts
     for parts in (
-        ("x", "y"), ("x", "y", "z"), ("x", "y", "z", "w"), ("x", "y", "theta"),
+        ("x", "y"), ("x", "y", "z"), ROTATION, ("x", "y", "theta"),
         ("position", "orientation"), ("translation", "rotation"), ("linear", "angular"), ("force", "torque"),
     )
 }  # fmt: skip
 """Messages that are nothing but numbers, by their members: a path may end at one, and takes its numbers in this order."""
+
+ONE_POINT = ("points[0].positions",)
+"""A trajectory's only point. Of several, a task has to say which one is the command."""
 
 _POSE = ("position", "orientation")
 _TRANSFORM = ("translation", "rotation")
@@ -55,11 +61,11 @@ _FIELDS: dict[str, tuple[str, ...]] = {
     "geometry_msgs/PointStamped": ("point",),
     "geometry_msgs/Vector3": _XYZ,
     "geometry_msgs/Vector3Stamped": ("vector",),
-    "geometry_msgs/Quaternion": (*_XYZ, "w"),
+    "geometry_msgs/Quaternion": ROTATION,
     "geometry_msgs/QuaternionStamped": ("quaternion",),
     "nav_msgs/Odometry": ("pose.pose",),
     "turtlesim/Pose": ("x", "y", "theta"),
-    "trajectory_msgs/JointTrajectory": ("points[0].positions",),
+    "trajectory_msgs/JointTrajectory": ONE_POINT,
     "trajectory_msgs/JointTrajectoryPoint": ("positions",),
     "control_msgs/GripperCommand": ("position",),
     "ackermann_msgs/AckermannDrive": ("steering_angle", "speed"),
@@ -75,7 +81,7 @@ _FIELDS: dict[str, tuple[str, ...]] = {
     "foxglove.Point3InFrame": ("point",),
     "foxglove.Vector2": ("x", "y"),
     "foxglove.Vector3": _XYZ,
-    "foxglove.Quaternion": (*_XYZ, "w"),
+    "foxglove.Quaternion": ROTATION,
     "foxglove.LocationFix": ("latitude", "longitude", "altitude"),
     **{
         f"std_msgs/{kind}{shape}": ("data",)

@@ -7,11 +7,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from vilp_data.decode.field_paths import fields_here, follow, parse_path
-from vilp_data.decode.message_body import cannot_decode, first_member, member, member_names, require_member
-from vilp_data.decode.usual_fields import PARTS_OF, usual_fields
+from vilp_data.decode.message_body import cannot_decode, first_member, member, member_names, number, require_member
+from vilp_data.decode.numeric_fields import as_numbers
+from vilp_data.decode.usual_fields import ONE_POINT, PARTS_OF, ROTATION, usual_fields
 from vilp_data.errors import nearest
 from vilp_data.types import F64, Message
 
@@ -45,11 +45,26 @@ def compile_fields(fields: tuple[str, ...], names: tuple[str, ...] = ()) -> Vect
             published = published_names(message)
             if published not in orders:
                 orders[published] = _order(message, published, names)
-            for number, path in enumerate(chosen):
-                parts[number] = _reordered(message, path, parts[number], orders[published], len(published))
+            for place, path in enumerate(chosen):
+                parts[place] = _reordered(message, path, parts[place], orders[published], len(published))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     return read
+
+
+def rotation_columns(message: Message, fields: Sequence[str] = ()) -> tuple[int, ...]:
+    """Where in the vector of a message each quaternion begins: of a path that leads to a rotation or to a message with some in it (a
+    pose, a list of poses), and of four paths in a row that are one's x, y, z and w."""
+    found: list[int] = []
+    paths, size = fields or _default_fields(message), 0
+    for place, path in enumerate(paths):
+        value = follow(message, path)
+        found += [size + column for column in _rotations_in(value)[0]]
+        base = path.removesuffix("x")
+        if path.endswith("x") and tuple(paths[place : place + 4]) == tuple(base + axis for axis in "xyzw"):
+            found.append(size)
+        size += len(_numbers(message, path, value))
+    return tuple(found)
 
 
 def concerns(message: Message, names: Sequence[str]) -> bool:
@@ -62,9 +77,17 @@ def concerns(message: Message, names: Sequence[str]) -> bool:
 
 
 def published_names(message: Message) -> tuple[str, ...]:
-    """The names that a message's lists are parallel to; empty where it has none."""
+    """The names that a message's lists are parallel to; empty where it has none. DecodeError where what should be names is none."""
     joints = member(message.body, "joints", None)
-    return tuple((first_member(message.body, NAME_LISTS) or ()) if joints is None else require_member(joints, "name"))
+    try:
+        names = first_member(message.body, NAME_LISTS) if joints is None else require_member(joints, "name")
+        listed = () if names is None or isinstance(names, str) else tuple(names)
+    except (AttributeError, KeyError, TypeError):
+        listed = (None,)
+    if not all(isinstance(name, str) for name in listed):
+        remedy = "leave the topic out, or this message where it is the only one"
+        raise cannot_decode(message, "the names of its joints are no list of names", None, remedy)
+    return listed
 
 
 def _default_fields(message: Message) -> tuple[str, ...]:
@@ -78,6 +101,11 @@ def _default_fields(message: Message) -> tuple[str, ...]:
             message.schema,
             f"choose among the fields here: {fields_here(message)}",
         )
+    points = member(message.body, "points", ()) if fields == ONE_POINT else ()
+    if isinstance(points, Sequence) and len(points) > 1:
+        found = f'{len(points)} points; fields = ["points[-1].positions"] is where they end'
+        remedy = "name the point: controllers begin with where the robot is, or with where it should be next"
+        raise cannot_decode(message, "nothing says which point of a trajectory is the command", found, remedy)
     return fields
 
 
@@ -86,25 +114,22 @@ def _numbers(message: Message, path: str, value: Any) -> F64:
         return np.array([value])
     if type(value) is list and value and type(value[0]) is float and not any(type(item) is not float for item in value):
         return np.array(value)
-    flat = _flattened(value)
+    flat = _flattened(message, path, value)
     if flat is not None:
         return np.array(flat)
-    try:
-        array: npt.NDArray[Any] = np.asarray(value)
-    except ValueError:
-        array = np.empty(0, object)
-    if array.dtype.kind not in "fiub":
+    array = as_numbers(value)
+    if array is None:
         inside = [f"{path}.{name}" if path else name for name in member_names(value)]
         remedy = f"name its fields: {', '.join(inside)}" if inside else f"choose among: {fields_here(message)}"
         raise cannot_decode(message, f"field {path!r} holds no numbers", type(value).__name__, remedy)
-    return array.astype(np.float64).ravel()
+    return array.ravel()
 
 
-def _flattened(value: Any) -> list[float] | None:
+def _flattened(message: Message, path: str, value: Any) -> list[float] | None:
     """The numbers of a point, quaternion, pose, twist, …, or of a list of them, in their usual order; None for anything else."""
     if isinstance(value, list | tuple) and value and member_names(value[0]):
-        items = [_flattened(item) for item in value]
-        return None if any(item is None for item in items) else [number for item in items for number in item or ()]
+        items = [_flattened(message, path, item) for item in value]
+        return None if any(item is None for item in items) else [value for item in items for value in item or ()]
     names = PARTS_OF.get(frozenset(member_names(value)))
     if names is None:
         return None
@@ -112,12 +137,29 @@ def _flattened(value: Any) -> list[float] | None:
     for name in names:
         part = member(value, name)
         if isinstance(part, int | float):
-            out.append(float(part))
-        elif (inside := _flattened(part)) is not None:
+            out.append(number(part, message, f"field {path!r}"))
+        elif (inside := _flattened(message, path, part)) is not None:
             out += inside
         else:
             return None
     return out
+
+
+def _rotations_in(value: Any) -> tuple[list[int], int]:
+    """Where in the numbers that `_flattened` gives each quaternion begins, and how many numbers there are."""
+    if isinstance(value, list | tuple):
+        parts = list(value) if value and member_names(value[0]) else []
+    else:
+        names = PARTS_OF.get(frozenset(member_names(value)), ())
+        if names == ROTATION:
+            return [0], len(ROTATION)
+        parts = [member(value, name) for name in names]
+    found, size = [], 0
+    for part in parts:
+        inside, length = ([], 1) if isinstance(part, int | float) else _rotations_in(part)
+        found += [size + column for column in inside]
+        size += length
+    return found, size
 
 
 def _order(message: Message, published: tuple[str, ...], names: tuple[str, ...]) -> list[int]:

@@ -15,7 +15,7 @@ from vilp_data.errors import UsageError, nearest
 from vilp_data.export import diffusion_policy, lerobot, lerobot_check, robomimic
 from vilp_data.export.folder import MANIFEST, out_folder, require_free
 from vilp_data.export.job import ExportJob, Images, ViewWritten, Written
-from vilp_data.export.pieces import Choice, Piece, choose, common_shapes, one_rate_hz
+from vilp_data.export.segments import Choice, Segment, choose, common_rate_hz, common_shapes
 from vilp_data.spec import TaskSpec
 
 __all__ = ["FORMATS", "Choice", "ExportReport", "Format", "export_dataset"]
@@ -120,7 +120,7 @@ def export_dataset(
             progress(rows_done, 2 * chosen.n_rows)
 
     job = ExportJob(
-        store, spec, chosen, common_shapes(store, chosen), one_rate_hz(chosen.pieces), images or "h264", crf,
+        store, spec, chosen, common_shapes(store, chosen), common_rate_hz(chosen.segments), images or "h264", crf,
         marked=choice.masked == "mark" and bool(chosen.masked), step=step,
     )  # fmt: skip
     needed = int(kind.share.get(job.images if to == "lerobot" else "", 1.0) * job.raw_bytes) + SPARE_BYTES
@@ -162,7 +162,7 @@ def _require_outside(root: Path, out: Path) -> None:
 def _report(job: ExportJob, to: str, out: Path, choice: Choice, written: Written, verified: list[str]) -> ExportReport:
     chosen = job.chosen
     report = ExportReport(
-        format=to, out=str(out), episodes=len(chosen.pieces), stored_episodes=len({piece.entry.id for piece in chosen.pieces}),
+        format=to, out=str(out), episodes=len(chosen.segments), stored_episodes=len({segment.entry.id for segment in chosen.segments}),
         rows=chosen.n_rows, rate_hz=job.rate_hz, views=written.views, left_out=chosen.left_out, masked=chosen.masked,
         masked_as=choice.masked, cut_away=chosen.cut_away, carried=written.carried, notes=written.notes, verified=verified,
     )  # fmt: skip
@@ -175,9 +175,16 @@ def _report(job: ExportJob, to: str, out: Path, choice: Choice, written: Written
 
 def _not_carried(job: ExportJob, to: str) -> dict[str, str]:
     missing = {"age of each observation (age_s)": "no format has a place for it"}
-    states = sum(piece.entry.has_state for piece in job.chosen.pieces)
+    states = sum(segment.entry.has_state for segment in job.chosen.segments)
     if to != "robomimic" and states and not job.shapes.state:
-        missing["simulator state"] = f"{states} of {len(job.chosen.pieces)} episodes have one, or of different lengths"
+        missing["simulator state"] = (
+            f"{states} of {len(job.chosen.segments)} episodes have one, or of different lengths"
+        )
+    rates = sorted({segment.entry.rate_hz for segment in job.chosen.segments})
+    if rates[-1] / rates[0] - 1 > 1e-6:
+        missing["the rate of each episode"] = (
+            f"{rates[0]:.5g} to {rates[-1]:.5g} Hz; rows are counted at {job.rate_hz:g} Hz, and log_time_ns has the true times"
+        )
     n_rows, shown = job.chosen.n_rows, _n_stored_images(job)
     for view, count in shown.items():
         if count < n_rows:
@@ -191,9 +198,9 @@ def _not_carried(job: ExportJob, to: str) -> dict[str, str]:
 
 def _n_stored_images(job: ExportJob) -> dict[str, int]:
     """How many different images the whole episodes hold, view by view; cut ones are not counted."""
-    if any(not piece.is_whole for piece in job.chosen.pieces):
+    if any(not segment.is_whole for segment in job.chosen.segments):
         return {}
-    return {view: sum(piece.entry.n_frames[view] for piece in job.chosen.pieces) for view in job.shapes.views}
+    return {view: sum(segment.entry.n_frames[view] for segment in job.chosen.segments) for view in job.shapes.views}
 
 
 def _notes(job: ExportJob) -> list[str]:
@@ -215,7 +222,7 @@ def _notes(job: ExportJob) -> list[str]:
 def _write_card(job: ExportJob, folder: Path, to: str, report: ExportReport, licence: str | None) -> None:
     from vilp_data.dataset_card import write_card
 
-    ids = {piece.entry.id for piece in job.chosen.pieces}
+    ids = {segment.entry.id for segment in job.chosen.segments}
     write_card(job.store, folder / "README.md", licence=licence, only=ids, exported=_card_lines(to, report))
 
 
@@ -255,7 +262,7 @@ def _write_manifest(job: ExportJob, folder: Path, report: ExportReport, choice: 
         "options": {**asdict(choice), "images": job.images if report.format == "lerobot" else None, "crf": job.crf},
         "split": None if lock is None else {"hash": lock.hash, "seed": lock.seed, "ratio": lock.ratio},
         "spec": _spec_table(job.spec),
-        "episode_list": [_episode_table(piece) for piece in job.chosen.pieces],
+        "episode_list": [_episode_table(segment) for segment in job.chosen.segments],
         "sha256": files,
     }
     text = json.dumps(table, indent=1, ensure_ascii=False) + "\n"
@@ -266,14 +273,10 @@ def _spec_table(spec: TaskSpec) -> dict[str, Any]:
     return spec.model_dump(mode="json", by_alias=True)
 
 
-def _episode_table(piece: Piece) -> dict[str, Any]:
-    entry = piece.entry
-    return {
-        "episode": entry.id, "first_step": piece.first, "end_step": piece.end, "side": piece.side, "outcome": entry.outcome,
-        "tags": dict(entry.tags), "edits": dict(entry.edits), "findings": list(entry.findings), "source": entry.source,
-        "source_episode": entry.source_episode, "source_sha256": entry.source_sha256, "key": entry.key,
-        "content_sha256": entry.content_sha256,
-    }  # fmt: skip
+def _episode_table(segment: Segment) -> dict[str, Any]:
+    entry = segment.entry
+    told = {"edits": dict(entry.edits), "findings": list(entry.findings), "content_sha256": entry.content_sha256}
+    return segment.provenance | told
 
 
 def _sha256(path: Path) -> str:

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import zarr
 
-from vilp_data.errors import StoreError
+from vilp_data.export.compare import came_out_wrong
 from vilp_data.export.job import ExportJob, ViewWritten, Written
-from vilp_data.export.pieces import Piece, Rows
+from vilp_data.export.segments import Rows
 
 STORE = "replay.zarr"
 CHUNK_BYTES = 4 << 20
-AGAIN = "please report this; the dataset itself is untouched"
 
 
 def write(job: ExportJob, folder: Path) -> Written:
@@ -25,7 +24,7 @@ def write(job: ExportJob, folder: Path) -> Written:
     root = zarr.create_group(folder / STORE, zarr_format=2)
     root.attrs.update(_attributes(job))
     data = root.create_group("data")
-    ends = np.cumsum([piece.n_rows for piece in job.chosen.pieces])
+    ends = np.cumsum([segment.n_rows for segment in job.chosen.segments])
     root.create_group("meta").create_array("episode_ends", data=ends.astype(np.int64))
     arrays: dict[str, _Rows] = {}
     for _, rows in job.read():
@@ -107,37 +106,26 @@ def _attributes(job: ExportJob) -> dict[str, Any]:
         return named
 
     vectors = {"state": parts(job.low_dim, job.spec.low_dim), "action": parts(job.action, job.spec.action)}
-    episodes = [_episode(piece) for piece in job.chosen.pieces]
+    episodes = [segment.provenance for segment in job.chosen.segments]
     table = {"task": job.spec.name, "rate_hz": job.rate_hz, "vectors": vectors, "episodes": episodes}
     return {"vilp": json.loads(json.dumps(table))}
-
-
-def _episode(piece: Piece) -> dict[str, Any]:
-    entry = piece.entry
-    return {
-        "episode": entry.id, "first_step": piece.first, "end_step": piece.end, "side": piece.side, "outcome": entry.outcome,
-        "tags": dict(sorted(entry.tags.items())), "source": entry.source, "source_episode": entry.source_episode,
-        "source_sha256": entry.source_sha256, "key": entry.key,
-    }  # fmt: skip
 
 
 def check(job: ExportJob, folder: Path, written: Written) -> list[str]:
     """What was compared, in words. Raises StoreError at the first difference."""
     root = zarr.open_group(folder / STORE, mode="r")
     data, ends, first = root["data"], root["meta/episode_ends"][:].tolist(), 0
-    for (piece, rows), end in zip(job.read(), ends, strict=True):
+    for (segment, rows), end in zip(job.read(), ends, strict=True):
         for name, values in columns(job, rows).items():
             if not np.array_equal(data[name][first:end], values, equal_nan=values.dtype.kind == "f"):
-                raise StoreError(f"{name} came out different", where=piece, remedy=AGAIN)
+                raise came_out_wrong(f"{name} came out different", segment)
         for view, frames in rows.frames.items():
             shown = rows.shown[view]
             step = max(CHUNK_BYTES // frames[0].nbytes, 1)
             for row in range(0, len(shown), step):
                 part = shown[row : row + step]
                 if not np.array_equal(data[image_name(job, view)][first + row : first + row + len(part)], frames[part]):
-                    raise StoreError(
-                        "a frame came out different", where=f"{piece}, view {view}, from row {row}", remedy=AGAIN
-                    )
+                    raise came_out_wrong("a frame came out different", f"{segment}, view {view}, from row {row}")
         first = end
     frames_words = f"{len(job.shapes.views) * job.chosen.n_rows} frames"
     return [

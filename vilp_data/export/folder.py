@@ -27,15 +27,17 @@ def out_folder(out: Path, *, force: bool, needed_bytes: int) -> Iterator[Path]:
     process is writing the same export."""
     out = out.absolute()
     require_free(out, force=force)
-    temporary = out.with_name(f".{out.name}.export.tmp")
+    temporary, aside = out.with_name(f".{out.name}.export.tmp"), out.with_name(f".{out.name}.export.old")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         require_space(out.parent, int(HEADROOM * needed_bytes))
         with _owned(temporary):
             try:
+                if _put_back(aside, out):
+                    require_free(out, force=force)
                 yield temporary
                 _sync(temporary)
-                _take_place(temporary, out)
+                _take_place(temporary, out, aside)
             except BaseException:
                 shutil.rmtree(temporary, ignore_errors=True)
                 raise
@@ -109,17 +111,29 @@ def _sync(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _take_place(temporary: Path, out: Path) -> None:
+def _put_back(aside: Path, out: Path) -> bool:
+    """Finish what a killed export left: the earlier export has its name again where the kill came before the new one took it, else is gone.
+    Whether it came back."""
+    if not aside.is_dir():
+        return False
+    if out.exists() and any(out.iterdir()):
+        shutil.rmtree(aside, ignore_errors=True)
+        return False
+    aside.replace(out)
+    shards.sync_folder(out.parent)
+    return True
+
+
+def _take_place(temporary: Path, out: Path, aside: Path) -> None:
     """Rename; an export that was there steps aside first, and comes back where the rename fails."""
     if not out.is_dir():
         temporary.rename(out)
         return
-    aside = out.with_name(f".{out.name}.export.old")
-    shutil.rmtree(aside, ignore_errors=True)
     out.rename(aside)
     try:
         temporary.rename(out)
     except BaseException:
         aside.rename(out)
         raise
+    shards.sync_folder(out.parent)  # the old one goes when the new one has its name for good
     shutil.rmtree(aside, ignore_errors=True)

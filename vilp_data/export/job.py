@@ -11,11 +11,10 @@ from typing import Literal
 import numpy as np
 
 from vilp_data.episodes import EpisodeStore
-from vilp_data.export.pieces import Chosen, Piece, Rows, Shapes, read_pieces
+from vilp_data.export.segments import Chosen, Rows, Segment, Shapes, read_segments
 from vilp_data.export.video import frame_rate
 from vilp_data.plots import vector_parts
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.types import F32, U8
 
 Images = Literal["h264", "h264-420", "lossless", "png"]
 
@@ -65,29 +64,29 @@ class ExportJob:
     def action(self) -> tuple[Column, ...]:
         return _columns(self.shapes.action or 0, self.spec.action, "action")
 
-    def read(self) -> Iterator[tuple[Piece, Rows]]:
-        """Every piece with its rows, in the order of the export."""
-        for piece, rows in read_pieces(self.store, self.chosen.pieces, self.shapes.action):
-            yield piece, rows
-            self.step(piece.n_rows)
+    def read(self) -> Iterator[tuple[Segment, Rows]]:
+        """Every segment with its rows, in the order of the export."""
+        for segment, rows in read_segments(self.store, self.chosen.segments, self.shapes.action):
+            yield segment, rows
+            self.step(segment.n_rows)
 
-    def task_of(self, piece: Piece) -> str:
-        """What the piece shows, in words."""
-        return next((piece.entry.tags[tag] for tag in TASK_TAGS if piece.entry.tags.get(tag)), self.spec.name)
+    def task_of(self, segment: Segment) -> str:
+        """What the segment shows, in words."""
+        return next((segment.entry.tags[tag] for tag in TASK_TAGS if segment.entry.tags.get(tag)), self.spec.name)
 
     def depth_views(self) -> set[str]:
         """Views of one channel."""
         return {view for view, shape in self.shapes.views.items() if shape[-1] == 1}
 
-    def piece_bytes(self, piece: Piece) -> int:
-        """What a piece's rows would take without any compression."""
+    def segment_bytes(self, segment: Segment) -> int:
+        """What a segment's rows would take without any compression."""
         numbers = 4 * (self.shapes.low_dim + (self.shapes.action or 0)) + 8 * (self.shapes.state or 0) + 32
-        return piece.n_rows * (numbers + sum(int(np.prod(shape)) for shape in self.shapes.views.values()))
+        return segment.n_rows * (numbers + sum(int(np.prod(shape)) for shape in self.shapes.views.values()))
 
     @property
     def raw_bytes(self) -> int:
         """The same of all rows."""
-        return sum(self.piece_bytes(piece) for piece in self.chosen.pieces)
+        return sum(self.segment_bytes(segment) for segment in self.chosen.segments)
 
 
 def _columns(width: int, parts: Mapping[str, ActionSpec | VectorSpec], whole: str) -> tuple[Column, ...]:
@@ -120,48 +119,3 @@ class Written:
     carried: dict[str, str] = field(default_factory=dict)
     not_carried: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-
-
-@dataclass
-class FrameErrors:
-    """Squared errors of frames that were read back, and whether row k really holds frame k.
-
-    A codec smears, so one frame may look more like its neighbour; over an episode, the frames must be nearest to their own."""
-
-    squared: float = 0.0
-    n_values: int = 0
-    worst: float = 0.0
-    _own: float = 0.0
-    _shifted: tuple[float, float] = (0.0, 0.0)
-
-    def add(self, found: U8, before: U8 | None, stored: U8, after: U8 | None) -> None:
-        """One frame against the stored one, and those that the rows before and after it show (None at the ends)."""
-        error = _squared_error(found, stored)
-        self.squared += error
-        self.n_values += found.size
-        self.worst = max(self.worst, error / found.size)
-        earlier = _squared_error(found, before) if before is not None and error else error
-        later = _squared_error(found, after) if after is not None and error else error
-        self._own += error
-        self._shifted = self._shifted[0] + earlier, self._shifted[1] + later
-
-    def end_episode(self) -> bool:
-        """Whether the episode's frames are nearest to their own rows; the next episode begins."""
-        right = self._own <= min(self._shifted)
-        self._own, self._shifted = 0.0, (0.0, 0.0)
-        return right
-
-    def psnr_db(self) -> tuple[float | None, float | None]:
-        """Of all pixels, and of the worst frame; None where there was no error."""
-        if not self.squared:
-            return None, None
-        return _psnr(self.squared / self.n_values), _psnr(self.worst)
-
-
-def _squared_error(one: U8, other: U8) -> float:
-    difference: F32 = one.astype(np.float32) - other
-    return float(np.square(difference, out=difference).sum(dtype=np.float64))
-
-
-def _psnr(mean_squared: float) -> float:
-    return round(float(10 * np.log10(255.0**2 / mean_squared)), 2)

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from vilp_data.export.job import ExportJob, ViewWritten, Written
 from vilp_data.export.lerobot_stats import Stats, flat, image_stats, pixel_counts, vector_stats
-from vilp_data.export.pieces import Piece, Rows
+from vilp_data.export.segments import Rows, Segment
 from vilp_data.export.video import CODINGS, Coding, VideoWriter, rgb
 from vilp_data.types import I64, U8
 
@@ -62,19 +62,19 @@ def coding_of(job: ExportJob, view: str) -> Coding | None:
 
 def write(job: ExportJob, folder: Path) -> Written:
     """Write the dataset into an empty folder."""
-    tasks = list(dict.fromkeys(job.task_of(piece) for piece in job.chosen.pieces))
+    tasks = list(dict.fromkeys(job.task_of(segment) for segment in job.chosen.segments))
     files = _Files(job, folder)
     episodes: list[dict[str, Any]] = []
     totals = _Totals()
     try:
-        for number, (piece, rows) in enumerate(job.read()):
-            columns = _columns(job, piece, rows, number, files.n_rows, tasks.index(job.task_of(piece)))
+        for number, (segment, rows) in enumerate(job.read()):
+            columns = _columns(job, segment, rows, number, files.n_rows, tasks.index(job.task_of(segment)))
             counts = {view: pixel_counts(rgb(image) for image in rows.images(view)) for view in rows.frames}
             stats = {name: vector_stats(values) for name, values in columns.items()}
             stats |= {view_key(view): image_stats(count, len(rows)) for view, count in counts.items()}
             place = files.append(columns, rows)
-            episodes.append(_episode_row(job, piece, number, place, stats))
-            totals.add(piece, rows, columns, counts)
+            episodes.append(_episode_row(job, segment, number, place, stats))
+            totals.add(segment, rows, columns, counts)
     except BaseException:
         files.abandon()
         raise
@@ -87,12 +87,12 @@ def write(job: ExportJob, folder: Path) -> Written:
 
 
 def _columns(
-    job: ExportJob, piece: Piece, rows: Rows, number: int, first_index: int, task: int
+    job: ExportJob, segment: Segment, rows: Rows, number: int, first_index: int, task: int
 ) -> dict[str, npt.NDArray[Any]]:
     """Every column of numbers, [R] or [R,D], in order."""
     count = len(rows)
     done = np.zeros(count, np.bool_)
-    done[-1] = piece.ends_episode
+    done[-1] = segment.ends_episode
     columns: dict[str, npt.NDArray[Any]] = {"observation.state": rows.low_dim} if job.shapes.low_dim else {}
     columns |= {"action": rows.action} if rows.action is not None else {}
     columns |= {
@@ -206,11 +206,13 @@ class _Totals:
     n_rows: int = 0
     side: str | None = None
 
-    def add(self, piece: Piece, rows: Rows, columns: Mapping[str, npt.NDArray[Any]], counts: Mapping[str, I64]) -> None:
-        """Pieces come training side first: what comes after it is left out."""
-        if self.n_rows and self.side == "train" and piece.side != "train":
+    def add(
+        self, segment: Segment, rows: Rows, columns: Mapping[str, npt.NDArray[Any]], counts: Mapping[str, I64]
+    ) -> None:
+        """Segments come training side first: what comes after it is left out."""
+        if self.n_rows and self.side == "train" and segment.side != "train":
             return
-        self.side = piece.side
+        self.side = segment.side
         for name, values in columns.items():
             self.columns.setdefault(name, []).append(values)
         for view, count in counts.items():
@@ -223,16 +225,11 @@ class _Totals:
 
 
 def _episode_row(
-    job: ExportJob, piece: Piece, number: int, place: Mapping[str, Any], stats: Mapping[str, Stats]
+    job: ExportJob, segment: Segment, number: int, place: Mapping[str, Any], stats: Mapping[str, Stats]
 ) -> dict[str, Any]:
-    entry = piece.entry
-    row = {"episode_index": number, "tasks": [job.task_of(piece)], "length": piece.n_rows, **place, **flat(stats)}
+    row = {"episode_index": number, "tasks": [job.task_of(segment)], "length": segment.n_rows, **place, **flat(stats)}
     row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-    return row | {
-        "vilp/episode": entry.id, "vilp/first_step": piece.first, "vilp/end_step": piece.end, "vilp/side": piece.side or "",
-        "vilp/outcome": entry.outcome, "vilp/tags": json.dumps(dict(entry.tags), sort_keys=True), "vilp/source": entry.source,
-        "vilp/source_episode": entry.source_episode, "vilp/source_sha256": entry.source_sha256, "vilp/key": entry.key,
-    }  # fmt: skip
+    return row | {f"vilp/{name}": value for name, value in segment.flat_provenance.items()}
 
 
 def _write_meta(
@@ -263,17 +260,17 @@ def _tasks_table(tasks: list[str]) -> pa.Table:
 def _info(job: ExportJob, tasks: list[str], folder: Path) -> dict[str, Any]:
     features = _features(job)
     videos = any(table["dtype"] == "video" for table in features.values())
-    robots = {piece.entry.tags.get("robot") for piece in job.chosen.pieces}
+    robots = {segment.entry.tags.get("robot") for segment in job.chosen.segments}
     return {
         "codebase_version": VERSION,
         "robot_type": robots.pop() if len(robots) == 1 else None,
-        "total_episodes": len(job.chosen.pieces),
+        "total_episodes": len(job.chosen.segments),
         "total_frames": job.chosen.n_rows,
         "total_tasks": len(tasks),
         "chunks_size": CHUNK_FILES,
         "data_files_size_in_mb": DATA_FILE_MB,
         "video_files_size_in_mb": VIDEO_FILE_MB,
-        "fps": job.fps.numerator if job.fps.denominator == 1 else float(job.fps),
+        "fps": _info_fps(job),
         "splits": _splits(job),
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if videos else None,

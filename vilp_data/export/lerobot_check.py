@@ -14,14 +14,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from vilp_data.errors import StoreError
-from vilp_data.export.job import ExportJob, FrameErrors, Written
+from vilp_data.export.compare import FrameErrors, came_out_wrong
+from vilp_data.export.job import ExportJob, Written
 from vilp_data.export.lerobot import EPISODES_PATH, coding_of, view_key
-from vilp_data.export.pieces import Piece, Rows
+from vilp_data.export.segments import Rows, Segment
 from vilp_data.export.video import read_video, rgb
 from vilp_data.types import U8
-
-AGAIN = "please report this; the dataset itself is untouched"
 
 
 def check(job: ExportJob, folder: Path, written: Written) -> list[str]:
@@ -30,11 +28,11 @@ def check(job: ExportJob, folder: Path, written: Written) -> list[str]:
     listed = pq.read_table(folder / EPISODES_PATH).to_pylist()
     reader = _Reader(folder, info)
     errors = {view: FrameErrors() for view in job.shapes.views}
-    for (piece, rows), episode in zip(job.read(), listed, strict=True):
+    for (segment, rows), episode in zip(job.read(), listed, strict=True):
         table = reader.rows(episode)
-        _compare_columns(job, piece, rows, table)
+        _compare_columns(job, segment, rows, table)
         for view in job.shapes.views:
-            _compare_frames(job, piece, rows, view, reader.images(episode, table, view), errors[view])
+            _compare_frames(job, segment, rows, view, reader.images(episode, table, view), errors[view])
     reader.require_end()
     for view, error in errors.items():
         written.views[view].psnr_db, written.views[view].psnr_min_db = error.psnr_db()
@@ -76,11 +74,11 @@ class _Reader:
             self._videos[key] = path, 0, read_video(path, fps)
         _, done, frames = self._videos[key]
         if round(episode[f"videos/{key}/from_timestamp"] * float(fps)) != done:
-            raise StoreError("an episode does not begin where its table says", where=path, remedy=AGAIN)
+            raise came_out_wrong("an episode does not begin where its table says", path)
         for _ in range(table.num_rows):
             image = next(frames, None)
             if image is None:
-                raise StoreError("a video of fewer frames than rows", where=path, remedy=AGAIN)
+                raise came_out_wrong("a video of fewer frames than rows", path)
             yield image
         self._videos[key] = path, done + table.num_rows, frames
 
@@ -91,7 +89,7 @@ class _Reader:
 
     def _require_end_of(self, key: str) -> None:
         if key in self._videos and next(self._videos[key][2], None) is not None:
-            raise StoreError("a video of more frames than rows", where=self._videos[key][0], remedy=AGAIN)
+            raise came_out_wrong("a video of more frames than rows", self._videos[key][0])
 
     def _fps(self) -> Any:
         from vilp_data.export.video import frame_rate
@@ -99,7 +97,7 @@ class _Reader:
         return frame_rate(float(self._info["fps"]))
 
 
-def _compare_columns(job: ExportJob, piece: Piece, rows: Rows, table: pa.Table) -> None:
+def _compare_columns(job: ExportJob, segment: Segment, rows: Rows, table: pa.Table) -> None:
     expected: dict[str, npt.NDArray[Any] | None] = {
         "observation.state": rows.low_dim if job.shapes.low_dim else None,
         "action": rows.action,
@@ -116,11 +114,11 @@ def _compare_columns(job: ExportJob, piece: Piece, rows: Rows, table: pa.Table) 
         found = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
         got = found.to_numpy(zero_copy_only=False).reshape(values.shape)
         if not np.array_equal(got, values, equal_nan=values.dtype.kind == "f"):
-            raise StoreError(f"{name} came out different", where=piece, remedy=AGAIN)
+            raise came_out_wrong(f"{name} came out different", segment)
 
 
 def _compare_frames(
-    job: ExportJob, piece: Piece, rows: Rows, view: str, found: Iterator[U8], errors: FrameErrors
+    job: ExportJob, segment: Segment, rows: Rows, view: str, found: Iterator[U8], errors: FrameErrors
 ) -> None:
     coding = coding_of(job, view)
     lossless = coding is None or coding.crf is None
@@ -133,18 +131,14 @@ def _compare_frames(
         assert wanted is not None
         if lossless:
             if not np.array_equal(image, wanted):
-                raise StoreError(
-                    "a lossless frame came out different", where=f"{piece}, view {view}, row {row}", remedy=AGAIN
-                )
+                raise came_out_wrong("a lossless frame came out different", f"{segment}, view {view}, row {row}")
             continue
         errors.add(image, before, wanted, after)
     if row + 1 != len(shown):
-        raise StoreError("frames and rows differ in number", where=f"{piece}, view {view}", found=f"{row + 1} and {len(shown)}",
-                         remedy=AGAIN)  # fmt: skip
+        counts = f"{row + 1} and {len(shown)}"
+        raise came_out_wrong("frames and rows differ in number", f"{segment}, view {view}", found=counts)
     if not errors.end_episode():
-        raise StoreError(
-            "frames that lie nearer to their neighbours' rows", where=f"{piece}, view {view}", remedy=AGAIN
-        )
+        raise came_out_wrong("frames that lie nearer to their neighbours' rows", f"{segment}, view {view}")
 
 
 def _like(stored: U8, found: U8) -> U8:

@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from vilp_data.errors import StoreError
+from vilp_data.export.compare import came_out_wrong
 from vilp_data.export.folder import require_space
 from vilp_data.export.job import Column, ExportJob, ViewWritten, Written
-from vilp_data.export.pieces import Piece, Rows
+from vilp_data.export.segments import Rows, Segment
 
 FILE = "demos.hdf5"
 MASKS = {"train": "train", "val": "valid"}
@@ -24,7 +24,6 @@ SPARE_BYTES = 1 << 20
 """Kept free beside each demonstration: HDF5 does not survive a full disk, and takes the process with it."""
 
 SUCCESS = {"success": "true", "failure": "false"}
-AGAIN = "please report this; the dataset itself is untouched"
 _OURS = frozenset({"num_samples", "model_file", "success"})
 
 
@@ -36,13 +35,13 @@ def write(job: ExportJob, folder: Path) -> Written:
         data.attrs["env_args"] = json.dumps(_env_args(job), indent=1)
         data.attrs["vilp"] = json.dumps(_vectors(job), indent=1)
         furthest = 0.0
-        for number, (piece, rows) in enumerate(job.read()):
+        for number, (segment, rows) in enumerate(job.read()):
             if rows.action is not None:
                 furthest = max(furthest, float(np.nan_to_num(np.abs(rows.action)).max(initial=0)))
-            require_space(folder, job.piece_bytes(piece) + SPARE_BYTES)
+            require_space(folder, job.segment_bytes(segment) + SPARE_BYTES)
             group = data.create_group(f"demo_{number}")
-            _write_attributes(group, piece)
-            for name, values in _arrays(job, piece, rows).items():
+            _write_attributes(group, segment)
+            for name, values in _arrays(job, segment, rows).items():
                 group.create_dataset(name, data=values)
             for view in rows.frames:
                 _write_images(group, view, rows)
@@ -75,21 +74,16 @@ def _vectors(job: ExportJob) -> dict[str, Any]:
     return {"task": job.spec.name, "rate_hz": job.rate_hz, "action": parts}
 
 
-def _write_attributes(group: h5py.Group, piece: Piece) -> None:
+def _write_attributes(group: h5py.Group, segment: Segment) -> None:
     """The demonstration's length, its tags under their own names, and where it comes from."""
-    entry = piece.entry
+    entry = segment.entry
     for name, text in entry.tags.items():
         if name not in _OURS and not name.startswith("vilp_"):
             group.attrs[name] = text
     if entry.outcome in SUCCESS:
         group.attrs["success"] = SUCCESS[entry.outcome]
-    group.attrs["num_samples"] = piece.n_rows
-    ours = {
-        "episode": entry.id, "first_step": piece.first, "end_step": piece.end, "side": piece.side or "", "outcome": entry.outcome,
-        "tags": json.dumps(dict(entry.tags), sort_keys=True), "source": entry.source, "source_episode": entry.source_episode,
-        "source_sha256": entry.source_sha256, "key": entry.key,
-    }  # fmt: skip
-    for name, value in ours.items():
+    group.attrs["num_samples"] = segment.n_rows
+    for name, value in segment.flat_provenance.items():
         group.attrs[f"vilp_{name}"] = value
 
 
@@ -99,12 +93,12 @@ def part_name(job: ExportJob, column: Column) -> str:
     return f"low_dim_{name}" if name in {f"{view}_image" for view in job.shapes.views} else name
 
 
-def _arrays(job: ExportJob, piece: Piece, rows: Rows) -> dict[str, npt.NDArray[Any]]:
+def _arrays(job: ExportJob, segment: Segment, rows: Rows) -> dict[str, npt.NDArray[Any]]:
     """Everything of a demonstration but its images, by path."""
     count = len(rows)
     done, reward = np.zeros(count, np.int64), np.zeros(count, np.float32)
-    done[-1] = piece.ends_episode
-    reward[-1] = piece.ends_episode and piece.entry.outcome == "success"
+    done[-1] = segment.ends_episode
+    reward[-1] = segment.ends_episode and segment.entry.outcome == "success"
     arrays: dict[str, npt.NDArray[Any]] = {
         f"obs/{part_name(job, part)}": rows.low_dim[:, part.span] for part in job.low_dim
     }
@@ -126,7 +120,7 @@ def _write_images(group: h5py.Group, view: str, rows: Rows) -> None:
 
 def _write_masks(file: h5py.File, job: ExportJob) -> None:
     for side, mask in MASKS.items():
-        names = [f"demo_{number}" for number, piece in enumerate(job.chosen.pieces) if piece.side == side]
+        names = [f"demo_{number}" for number, segment in enumerate(job.chosen.segments) if segment.side == side]
         if names:
             file.create_dataset(f"mask/{mask}", data=np.array(names, "S"))
 
@@ -134,25 +128,25 @@ def _write_masks(file: h5py.File, job: ExportJob) -> None:
 def check(job: ExportJob, folder: Path, written: Written) -> list[str]:
     """What was compared, in words. Raises StoreError at the first difference."""
     with h5py.File(folder / FILE, "r") as file:
-        if len(file["data"]) != len(job.chosen.pieces):
-            raise StoreError("demonstrations are missing", where=folder / FILE, remedy=AGAIN)
-        for number, (piece, rows) in enumerate(job.read()):
+        if len(file["data"]) != len(job.chosen.segments):
+            raise came_out_wrong("demonstrations are missing", folder / FILE)
+        for number, (segment, rows) in enumerate(job.read()):
             group = file[f"data/demo_{number}"]
-            for name, values in _arrays(job, piece, rows).items():
+            for name, values in _arrays(job, segment, rows).items():
                 if not np.array_equal(group[name][:], values, equal_nan=values.dtype.kind == "f"):
-                    raise StoreError(f"{name} came out different", where=piece, remedy=AGAIN)
+                    raise came_out_wrong(f"{name} came out different", segment)
             for view in rows.frames:
-                _compare_images(group[f"obs/{view}_image"], piece, rows, view)
+                _compare_images(group[f"obs/{view}_image"], segment, rows, view)
     frames = f"{len(job.shapes.views) * job.chosen.n_rows} frames"
     return [f"{job.chosen.n_rows} rows equal to the stored steps", f"{frames} equal to the stored ones, bit for bit"]
 
 
-def _compare_images(found: h5py.Dataset, piece: Piece, rows: Rows, view: str) -> None:
+def _compare_images(found: h5py.Dataset, segment: Segment, rows: Rows, view: str) -> None:
     if len(found) != len(rows):
-        raise StoreError("frames and rows differ in number", where=f"{piece}, view {view}", remedy=AGAIN)
+        raise came_out_wrong("frames and rows differ in number", f"{segment}, view {view}")
     for row, image in enumerate(rows.images(view)):
         if not np.array_equal(found[row], image):
-            raise StoreError("a frame came out different", where=f"{piece}, view {view}, row {row}", remedy=AGAIN)
+            raise came_out_wrong("a frame came out different", f"{segment}, view {view}, row {row}")
 
 
 def _told(job: ExportJob, folder: Path) -> Written:
@@ -167,10 +161,10 @@ def _told(job: ExportJob, folder: Path) -> Written:
         "end of an episode": "dones, 1 at its last step; rewards, 1 there where the outcome is a success",
         "tags, outcome, source, SHA-256": "attributes of each demonstration: tags by name, the rest as vilp_…",
     }
-    if any(piece.entry.has_state for piece in job.chosen.pieces):
+    if any(segment.entry.has_state for segment in job.chosen.segments):
         written.carried["simulator state"] = "states"
     written.carried |= {"masked steps": "valid; their numbers are NaN"} if job.marked else {}
-    unknown = sum(piece.entry.outcome == "unknown" for piece in job.chosen.pieces)
+    unknown = sum(segment.entry.outcome == "unknown" for segment in job.chosen.segments)
     if unknown:
         written.notes.append(
             f"rewards say nothing of {unknown} demonstrations: whether they succeeded is not known, and all are 0"

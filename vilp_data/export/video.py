@@ -12,7 +12,8 @@ import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 
-from vilp_data.errors import StoreError, UsageError
+from vilp_data.errors import UsageError
+from vilp_data.export.compare import came_out_wrong
 from vilp_data.types import U8
 
 KEY_EVERY = 10
@@ -123,7 +124,5 @@ def read_video(path: Path, fps: Fraction) -> Iterator[U8]:
             time_s = None if frame.pts is None or frame.time_base is None else frame.pts * frame.time_base
             if time_s != number / fps:
                 found = f"frame {number} at {time_s} s instead of {number / fps} s"
-                raise StoreError(
-                    "a video that came out with other times", where=path, found=found, remedy="please report this"
-                )
+                raise came_out_wrong("a video that came out with other times", path, found=found)
             yield np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)

@@ -24,9 +24,8 @@ from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sims.episode_log import START_NS
-from vilp_data.sources import open_log
+from vilp_data.sims.finished_log import finished_tags
 from vilp_data.spec import TaskSpec
-from vilp_data.types import EPISODE_RECORD
 
 if TYPE_CHECKING:
     from vilp_data.sims.hanoi import HanoiEnv
@@ -116,20 +115,15 @@ def _log_path(folder: Path, task: str, seed: int) -> Path:
 
 
 def _finished(job: _Job) -> RecordedEpisode | None:
-    """The episode in a log that is already there and whole; UsageError where it was made with other options."""
-    if not job.path.exists():
-        return None
+    """The episode in a log that is already there; UsageError where it was made with other options. One that is damaged is made again:
+    its seed gives the same."""
     try:
-        with open_log(job.path) as log:
-            tags = log.metadata().get(EPISODE_RECORD, {})
+        tags = finished_tags(job.path, {"options": _options_text(job)})
     except LogError:
         return None
-    if tags.get("options") != _options_text(job):
-        raise UsageError(
-            "this log was recorded with other options", where=job.path, found=f"{tags.get('options')}, now {_options_text(job)}",
-            remedy="record into another folder, or move that log away",
-        )  # fmt: skip
-    return RecordedEpisode(job.path, job.seed, tags["success"] == "true", int(tags["n_steps"]))
+    return (
+        None if tags is None else RecordedEpisode(job.path, job.seed, tags["success"] == "true", int(tags["n_steps"]))
+    )
 
 
 def _options_text(job: _Job) -> str:

@@ -11,11 +11,12 @@ demonstration is refused: a state put into another world would draw pictures of 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,11 @@ from vilp_data.engine import map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import NO_LATENCY, EpisodeRecorder
 from vilp_data.sims.episode_log import START_NS
+from vilp_data.sims.finished_log import finished_tags
 from vilp_data.sims.record import require_simulator
 from vilp_data.sources import open_log
 from vilp_data.sources.hdf5_log import Hdf5Log
-from vilp_data.types import EPISODE_RECORD, F64, U8
+from vilp_data.types import F64, U8
 
 STATES, ACTIONS = "states", "actions"
 CONTROL_RATE_HZ = 20.0  # robosuite's own, where a file does not state its rate
@@ -62,6 +64,7 @@ class _Job:
     source: Path
     demonstration: str
     sha256: str
+    world_sha256: str
     path: Path
     options: RenderOptions
 
@@ -71,8 +74,9 @@ def render_demonstrations(
 ) -> list[RenderedDemo]:  # fmt: skip
     """Draw every demonstration of the HDF5 files into `out/<environment>-<demonstration>.mcap`.
 
-    A finished log of the same states and options is kept. UsageError where a file holds no states, its environment or a camera is
-    not known, the simulator is missing, or a log in `out` is of something else; LogError where a file is damaged."""
+    A finished log of the same states, world and options, drawn by the same versions, is kept. UsageError where a file holds no states,
+    its environment or a camera is not known, the simulator is missing, or a file in `out` is of something else; LogError where a file
+    is damaged."""
     jobs = [job for source in sources for job in _jobs(source, out, options)]
     if twice := [job for n, job in enumerate(jobs) if job.path in {other.path for other in jobs[:n]}]:
         raise UsageError(
@@ -101,9 +105,10 @@ def _jobs(source: Path, out: Path, options: RenderOptions) -> list[_Job]:
             known = ", ".join(topic.name for topic in log.topics())
             remedy = "only files with simulator states can be drawn; one with images is a log already: ingest it"
             raise UsageError("no simulator states in this file", where=source, found=known, remedy=remedy)
-        environment = _environment(log)[0]
+        environment, arguments = _environment(log)
         return [
             _Job(source, episode.name, log.demonstration_sha256(episode.name),
+                 _world_sha256(environment, arguments, log.model_text(episode.name)),
                  out / f"{limits.file_name(f'{environment}-{episode.name}')}.mcap", options)
             for episode in log.episodes()
         ]  # fmt: skip
@@ -337,33 +342,47 @@ def _quaternion_xyzw(rotation: F64) -> F64:
 # --- what a log says of itself ----------------------------------------------------------------------------------------------------
 
 
+def _made_from(job: _Job) -> dict[str, str]:
+    """Tags that tell whether the same pictures would be drawn again: states, world, options, and what draws them."""
+    options = {"cameras": job.options.cameras, "size": [job.options.height, job.options.width]}
+    return {
+        "demonstration_sha256": job.sha256,
+        "world_sha256": job.world_sha256,
+        "options": json.dumps({**options, "rate_hz": job.options.rate_hz}),
+        **{f"{name}_version": _version(name) for name in ("vilp", "robosuite", "mujoco")},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _world_sha256(environment: str, arguments: dict[str, Any], model_text: str | None) -> str:
+    """Of what the world is built from, beside the simulator."""
+    return hashlib.sha256(json.dumps([environment, arguments, model_text], sort_keys=True).encode()).hexdigest()
+
+
 def _tags(job: _Job, environment: str) -> dict[str, str]:
     return {
         "task": environment,
         "source_file": job.source.name,
         "demonstration": job.demonstration,
-        "demonstration_sha256": job.sha256,
-        "options": _options_text(job.options),
-        **{f"{name}_version": version(name) for name in ("vilp", "robosuite", "mujoco")},
+        **_made_from(job),
     }
 
 
-def _options_text(options: RenderOptions) -> str:
-    return json.dumps({"cameras": options.cameras, "size": [options.height, options.width], "rate_hz": options.rate_hz})
-
-
 def _finished(job: _Job) -> RenderedDemo | None:
-    """The log that is there already and whole; UsageError where it is of other states or options."""
-    if not job.path.exists():
-        return None
+    """The log that is there already; UsageError where it was drawn from something else, or is no log that can be read."""
     try:
-        with open_log(job.path) as log:
-            tags = log.metadata().get(EPISODE_RECORD, {})
-    except LogError:
+        tags = finished_tags(job.path, _made_from(job))
+    except LogError as error:
+        remedy = "move it away, or render into another folder: logs of this command appear whole or not at all"
+        raise UsageError(
+            "a damaged or foreign file is in the way", where=job.path, found=error.what, remedy=remedy
+        ) from error
+    if tags is None:
         return None
-    wanted = {"demonstration_sha256": job.sha256, "options": _options_text(job.options)}
-    if differing := [key for key, text in wanted.items() if tags.get(key) != text]:
-        found = f"another {differing[0]}: {tags.get(differing[0])}, now {wanted[differing[0]]}"
-        remedy = "render into another folder, or move that log away"
-        raise UsageError("this log was made from something else", where=job.path, found=found, remedy=remedy)
-    return RenderedDemo(job.path, job.demonstration, tags["success"] == "true", int(tags["n_steps"]))
+    return RenderedDemo(job.path, job.demonstration, tags.get("success") == "true", int(tags.get("n_steps", 0)))

@@ -10,6 +10,7 @@ from typing import Protocol
 from vilp_data.errors import LogError, UsageError
 from vilp_data.sources.db3_log import MAGIC as SQLITE_MAGIC
 from vilp_data.sources.db3_log import Db3Log
+from vilp_data.sources.file_bytes import first_bytes
 from vilp_data.sources.hdf5_log import Hdf5Log
 from vilp_data.sources.hdf5_tree import MAGIC as HDF5_MAGIC
 from vilp_data.sources.lerobot_log import LeRobotLog
@@ -20,12 +21,10 @@ from vilp_data.sources.message_decoders import ZSTD_MAGIC, MessageError
 from vilp_data.sources.rosbag1_log import Rosbag1Log
 from vilp_data.sources.rosbag2_log import Rosbag2Log
 from vilp_data.sources.rosbag2_metadata import is_bag_folder, lone_file
-from vilp_data.sources.zarr_log import ZarrLog
+from vilp_data.sources.zarr_log import ZarrLog, is_zarr
 from vilp_data.types import I64, LogReader, Message
 
 __all__ = ["FORMATS", "IndexedLog", "LogFormat", "MessageError", "open_log"]
-
-HEAD_SIZE = 16  # bytes that tell every format here apart
 
 
 class IndexedLog(LogReader, Protocol):
@@ -39,20 +38,24 @@ class IndexedLog(LogReader, Protocol):
         """Up to `limit` early messages of a topic, reading as little as possible."""
         ...
 
+    def doubts(self) -> list[str]:
+        """Sentences on what seems to be missing, though all that is there can be read: what says so, and how much there is."""
+        ...
+
 
 @dataclass(frozen=True)
 class LogFormat:
-    """One row of the table: how to tell a format, and how to open it (None: known by sight, not read)."""
+    """One row of the table: how to tell a format by its path and first bytes, and how to open it."""
 
     name: str
     matches: Callable[[Path, bytes], bool]
-    open: Callable[[Path, float], IndexedLog] | None
+    open: Callable[[Path, float], IndexedLog]
 
 
 # The first match wins. A new format is one reader and one line here.
 FORMATS = (
     LogFormat("MCAP", lambda path, head: head.startswith(MCAP_MAGIC), lambda path, rate_hz: McapLog(path)),
-    LogFormat("zarr", lambda path, head: _is_zarr(path), lambda path, rate_hz: ZarrLog(path, array_rate_hz=rate_hz)),
+    LogFormat("zarr", lambda path, head: is_zarr(path), lambda path, rate_hz: ZarrLog(path, array_rate_hz=rate_hz)),
     LogFormat("LeRobot", lambda path, head: is_lerobot(path), lambda path, rate_hz: LeRobotLog(path)),
     LogFormat("ROS 1 bag", lambda path, head: head.startswith(b"#ROSBAG V"), lambda path, rate_hz: Rosbag1Log(path)),
     LogFormat("ROS 2 bag", lambda path, head: _is_rosbag2(path, head), lambda path, rate_hz: Rosbag2Log(path)),
@@ -75,13 +78,9 @@ def open_log(path: Path, *, array_rate_hz: float = 10.0) -> IndexedLog:
         raise UsageError("no such log", where=path, remedy="check the path")
     if is_bag_folder(path):
         path = lone_file(path) or path
-    head = _head(path)
+    head = first_bytes(path)
     for log_format in FORMATS:
         if log_format.matches(path, head):
-            if log_format.open is None:
-                raise LogError(
-                    f"a {log_format.name} log: not read yet", where=path, remedy=f"convert it to MCAP; {_readable()}"
-                )
             return log_format.open(path, array_rate_hz)
     raise _not_a_log(path, head)
 
@@ -89,21 +88,6 @@ def open_log(path: Path, *, array_rate_hz: float = 10.0) -> IndexedLog:
 def _is_rosbag2(path: Path, head: bytes) -> bool:
     """A bag's folder, or one compressed file of a bag."""
     return is_bag_folder(path) or head.startswith(ZSTD_MAGIC)
-
-
-def _is_zarr(path: Path) -> bool:
-    return path.is_dir() and any((path / name).is_file() for name in (".zgroup", "zarr.json"))
-
-
-def _head(path: Path) -> bytes:
-    try:
-        if path.is_dir():
-            next(path.iterdir(), None)
-            return b""
-        with path.open("rb") as stream:
-            return stream.read(HEAD_SIZE)
-    except OSError as error:
-        raise LogError("cannot be opened", where=path, found=error.strerror, remedy="check its permissions") from error
 
 
 def _not_a_log(path: Path, head: bytes) -> LogError:
@@ -136,5 +120,4 @@ def _not_a_log(path: Path, head: bytes) -> LogError:
 
 
 def _readable() -> str:
-    names = [log_format.name for log_format in FORMATS if log_format.open is not None]
-    return f"readable: {', '.join(names)}"
+    return f"readable: {', '.join(log_format.name for log_format in FORMATS)}"

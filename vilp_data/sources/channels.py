@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from mcap.records import Schema
 
-from vilp_data.errors import LogError, nearest
+from vilp_data.errors import LogError, nearest, reason
 from vilp_data.sources.message_decoders import MALFORMED, ROS_ENCODINGS, Decoder, MessageError, decoder_for, ros_name
 from vilp_data.types import Message, TopicInfo
 
@@ -92,7 +92,7 @@ class Channels:
             raise MessageError(
                 f"a message of {channel.topic} at {raw.log_time_ns} ns does not fit its schema",
                 where=f"{self._path}, topic {channel.topic}",
-                found=f"{channel.encoding} {channel.schema_name or '(no schema)'}, {len(raw.data)} bytes: {str(error) or repr(error)}",
+                found=f"{channel.encoding} {channel.schema_name or '(no schema)'}, {len(raw.data)} bytes: {reason(error)}",
                 remedy="leave the topic out of the task, or record it with a matching schema",
             ) from error
         return Message(channel.topic, channel.schema_name, raw.log_time_ns, raw.publish_time_ns, body)

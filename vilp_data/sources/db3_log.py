@@ -1,13 +1,14 @@
 """SQLite files of ROS 2 bags (.db3), of any schema version, opened read-only. One file is one episode, or a part of one.
 
-SQLite keeps no checksums: damage shows where its structure breaks, or where a message no longer fits its type."""
+SQLite keeps no checksums: damage shows where its structure breaks, or where a message no longer fits its type. Messages are counted by
+the table alone; they are read through the table's index of times, as SQLite chooses, so before that the index and every page are
+compared with the table: an index that lacks rows would otherwise be a shorter bag."""
 
 from __future__ import annotations
 
 import sqlite3
 import struct
 from array import array
-from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,14 +19,14 @@ import numpy as np
 from mcap.records import Schema
 
 from vilp_data import limits
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, copy_or_salvage, reason, salvage_command
 from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage
 from vilp_data.sources.folder_hash import file_sha256
 from vilp_data.sources.message_decoders import BEFORE_DEFINITIONS
+from vilp_data.sources.rosbag2_metadata import missing_from_file
 from vilp_data.types import I64, LogEpisode, Message, TopicInfo
 
 MAGIC = b"SQLite format 3\0"
-SALVAGE = "copy it again from where it was recorded; `vilp-data salvage` gets back what is there"
 END_OF_TIME_NS = (1 << 63) - 1  # SQLite's largest integer
 LISTED_TIMES = 1_000_000  # rows read by message_times: about a second
 INSTRUCTIONS = 1_000_000  # of SQLite's machine, between two looks at how much a query has done
@@ -61,32 +62,30 @@ class Db3Log:
         except BaseException:
             self._database.close()
             raise
-        self._counts: Counter[int] | None = None
+        self._known: list[tuple[int, int, int, int]] | None = None
+        self._is_sound = False
 
     def sha256(self) -> str:
         return file_sha256(self._file)
 
     def topics(self) -> list[TopicInfo]:
         """Every topic, sorted by name. Counting reads the file's table of messages once, not the messages."""
-        if self._counts is None:
-            self._counts = Counter(dict(self._rows("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id")))
-            if strange := self._counts.keys() - self._topic_ids:
-                raise self._damaged(
-                    f"messages of topics {sorted(map(str, strange))[:3]}, which the file does not describe"
-                )
-        return self._channels.topics(self._counts)
+        return self._channels.topics({topic_id: count for topic_id, count, _, _ in self._counted()})
 
     def metadata(self) -> dict[str, dict[str, str]]:
         return {}
 
     def episodes(self) -> list[LogEpisode]:
         """The whole file as one; none where it holds no message."""
-        ((first_ns, last_ns),) = self._rows(
-            "SELECT (SELECT MIN(timestamp) FROM messages), (SELECT MAX(timestamp) FROM messages)"
-        )
-        if first_ns is None:
+        counted = self._counted()
+        if not counted:
             return []
-        return [LogEpisode(WHOLE_FILE, self._whole(first_ns), self._whole(last_ns) + 1)]
+        first_ns, last_ns = min(first for *_, first, _ in counted), max(last for *_, last in counted)
+        return [LogEpisode(WHOLE_FILE, first_ns, last_ns + 1)]
+
+    def doubts(self) -> list[str]:
+        """Where the file is a part of a bag whose metadata.yaml counts other than as many messages in it."""
+        return missing_from_file(self.path, sum(count for _, count, _, _ in self._counted()))
 
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
@@ -98,12 +97,12 @@ class Db3Log:
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
         """The messages that `messages` gives, still serialised; ties as they were written. An unreadable topic is refused before
-        the first of any."""
+        the first of any; a file whose structure is damaged anywhere with the first one."""
         ids = sorted(self._channels.ids_of(topics))
         self._channels.require_decoders(ids)
         first = -END_OF_TIME_NS if start_ns is None else max(min(start_ns, END_OF_TIME_NS), -END_OF_TIME_NS)
         end = END_OF_TIME_NS if end_ns is None else max(min(end_ns, END_OF_TIME_NS), -END_OF_TIME_NS)
-        return self._raw(
+        return self._raw_of_sound(
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(ids))})"
             " AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
             (*ids, first, end),
@@ -148,13 +147,18 @@ class Db3Log:
         with self._file.open("rb") as stream:
             head = stream.read(100)
         if len(head) < 100:
-            raise LogError("the bag is cut off", where=self.path, found=f"{size} bytes", remedy=SALVAGE)
+            raise LogError(
+                "the bag is cut off", where=self.path, found=f"{size} bytes", remedy=copy_or_salvage(self.path)
+            )
         (page_size,) = struct.unpack_from(">H", head, 16)
         change, pages, pages_valid_for = (struct.unpack_from(">I", head, place)[0] for place in (24, 28, 92))
         expected = (65536 if page_size == 1 else page_size) * pages
         if change == pages_valid_for and size < expected:
             raise LogError(
-                "the bag is cut off", where=self.path, found=f"{size:,} of {expected:,} bytes", remedy=SALVAGE
+                "the bag is cut off",
+                where=self.path,
+                found=f"{size:,} of {expected:,} bytes",
+                remedy=copy_or_salvage(self.path),
             )
         for journal in (self._file.with_name(self._file.name + suffix) for suffix in ("-wal", "-journal")):
             if journal.is_file() and journal.stat().st_size:
@@ -162,7 +166,7 @@ class Db3Log:
                     "the recorder did not close this bag: its last messages are in a journal",
                     where=self.path,
                     found=f"{journal.name}, {journal.stat().st_size:,} bytes",
-                    remedy="keep both files together: `vilp-data salvage` makes one MCAP of them",
+                    remedy=f"keep both files together: {salvage_command(self.path)} makes one MCAP of them",
                 )
 
     def _guard(self) -> None:
@@ -208,10 +212,33 @@ class Db3Log:
             found[name] = {self._text(row[1]) for row in self._rows(f"PRAGMA table_info({name})")}
         return found
 
+    def _counted(self) -> list[tuple[int, int, int, int]]:
+        """(topic id, messages, log times of the first and the last) by the table itself."""
+        if self._known is None:
+            query = (
+                "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages NOT INDEXED GROUP BY topic_id"
+            )
+            known = list(self._rows(query))
+            if strange := {topic_id for topic_id, *_ in known} - self._topic_ids:
+                raise self._damaged(
+                    f"messages of topics {sorted(map(str, strange))[:3]}, which the file does not describe"
+                )
+            self._known = [(row[0], row[1], self._whole(row[2]), self._whole(row[3])) for row in known]
+        return self._known
+
+    def _refuse_unsound(self) -> None:
+        """LogError where SQLite finds fault with any page, or with what an index says of its table. Reads the file once."""
+        if not self._is_sound:
+            faults = [" ".join(texts[0].split()) for texts in self._texts("PRAGMA integrity_check(3)")]
+            if faults != ["ok"]:
+                raise self._damaged("; ".join(faults))
+            self._counted()
+            self._is_sound = True
+
     # --- rows -----------------------------------------------------------------------------------------------------------
 
     def _rows(self, query: str, values: tuple[int, ...] = ()) -> Iterator[Any]:
-        with self._damage_told():
+        with self._damage_as_log_error():
             self._budget = 10 * (self._file.stat().st_size + INSTRUCTIONS)
             cursor = self._database.execute(query, values)
             while (
@@ -229,14 +256,18 @@ class Db3Log:
             time = self._whole(time_ns)
             yield RawMessage(time, time, topic_id, data)
 
+    def _raw_of_sound(self, query: str, values: tuple[int, ...]) -> Iterator[RawMessage]:
+        self._refuse_unsound()
+        yield from self._raw(query, values)
+
     @contextmanager
-    def _damage_told(self) -> Iterator[None]:
+    def _damage_as_log_error(self) -> Iterator[None]:
         try:
             yield
         except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as error:
             if "interrupted" in str(error):
                 raise self._damaged("its tables lead in circles") from error
-            raise self._damaged(str(error) or repr(error)) from error
+            raise self._damaged(reason(error)) from error
 
     def _whole(self, value: object) -> int:
         if not isinstance(value, int):
@@ -249,4 +280,4 @@ class Db3Log:
         return value
 
     def _damaged(self, found: str) -> LogError:
-        return LogError("the bag is damaged", where=self.path, found=found, remedy=SALVAGE)
+        return LogError("the bag is damaged", where=self.path, found=found, remedy=copy_or_salvage(self.path))

@@ -2,7 +2,8 @@
 
 The file is copied first, with the journal beside it: opening it there lets SQLite finish or roll back what the recorder had begun,
 and leaves the bag as it was. A copy that is cut off is filled up with zeros, since SQLite reads no file that is shorter than it says.
-Rows are read from both ends towards the damage, and then around it.
+Rows are read from the table itself, from both ends towards the damage, and then around it; never through the index of times, which
+may lack some. Whether the table has all its rows, SQLite's own check of its trees says.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -17,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from mcap.records import Channel, Schema
-from rosbags.typesys import Stores, get_typestore
 
 from vilp_data import limits
 from vilp_data.errors import LogError
@@ -25,11 +26,40 @@ from vilp_data.salvage_report import SalvageReport
 from vilp_data.sources.file_bytes import FileBytes
 from vilp_data.sources.mcap_clean import CleanMcap
 from vilp_data.sources.mcap_records import MESSAGE_HEAD
-from vilp_data.sources.message_decoders import ros_name
+from vilp_data.sources.message_decoders import BEFORE_DEFINITIONS, stock_definition
 
 PROBES = 2000  # queries spent on damaged parts of the table
-STEP = 1000  # rows
+STEP, STEP_BYTES = 1000, 1 << 24  # rows that are turned around at a time, and their bytes
+LOWEST, HIGHEST = -(1 << 63), (1 << 63) - 1  # of SQLite's row ids
+INSTRUCTIONS = 1_000_000  # of SQLite's machine, between two looks at how much it has done
+TOTAL = 10  # of those per byte of the file: a row takes some 20 and is seen a few times, a tree that leads in circles takes any number
 BROKEN = (sqlite3.Error, OverflowError, MemoryError, ValueError)
+# The table itself, in order of its rows: `id` would be another column if the text that declares it were damaged.
+_ROWS = (
+    "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED WHERE rowid BETWEEN ? AND ? ORDER BY rowid {}"
+)
+
+
+class RowRanges:
+    """Row ids met so far, as ranges of consecutive ones: one for a table that lacks none."""
+
+    def __init__(self) -> None:
+        self._ranges: list[tuple[int, int]] = []  # sorted, disjoint: first and last
+
+    def add(self, number: int) -> bool:
+        """Note a row id; whether it is new."""
+        place = bisect_right(self._ranges, (number, HIGHEST))
+        first, last = self._ranges[place - 1] if place else (number, number - 2)
+        if number <= last:
+            return False
+        begin = place - 1 if number == last + 1 else place
+        after = place < len(self._ranges) and self._ranges[place][0] == number + 1
+        joined = (first if begin < place else number, self._ranges[place][1] if after else number)
+        self._ranges[begin : place + after] = [joined]
+        return True
+
+    def __len__(self) -> int:
+        return len(self._ranges)
 
 
 class Db3Salvage:
@@ -41,7 +71,7 @@ class Db3Salvage:
         self._report = report
         self._channels: dict[int, int] = {}
         self._unknown: Counter[int] = Counter()
-        self._seen: set[int] = set()
+        self._seen = RowRanges()
         self._probes = 0
         self._damaged = False
 
@@ -53,8 +83,11 @@ class Db3Salvage:
                 database.execute("PRAGMA trusted_schema = OFF")
                 database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(limits.RECORD_BYTES, (1 << 31) - 1))
                 database.text_factory = lambda data: data.decode(errors="replace")
+                self._set_budget(database)
                 self._describe(database)
                 self._read(database)
+                self._set_budget(database)
+                self._check(database)
         self._conclude()
 
     def _copied(self, folder: Path) -> Path:
@@ -76,23 +109,31 @@ class Db3Salvage:
             self._report.doubt(f"the file is cut off: {self._source.size:,} of {wanted:,} bytes")
         return copy
 
+    def _set_budget(self, database: sqlite3.Connection) -> None:
+        """What comes next ends, whatever circles the file's trees lead in: a query that does too much counts as damaged."""
+        self._budget = TOTAL * (self._source.size + INSTRUCTIONS)
+
+        def spent() -> int:
+            self._budget -= INSTRUCTIONS
+            return int(self._budget < 0)
+
+        database.set_progress_handler(spent, INSTRUCTIONS)
+
     # --- descriptions
 
     def _describe(self, database: sqlite3.Connection) -> None:
-        definitions: dict[str, tuple[str, str]] = {}
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        for name, encoding, text in self._some(database, query):
-            definitions[str(name)] = (str(encoding), str(text))
-        stock = get_typestore(Stores.LATEST)
+        definitions = {str(name): (str(encoding), str(text)) for name, encoding, text in self._some(database, query)}
+        release = next((str(row[0]) for row in self._some(database, "SELECT ros_distro FROM schema")), "")
         for number, topic, name, serialization in self._some(
-            database, "SELECT id, name, type, serialization_format FROM topics ORDER BY id", needed=True
+            database, "SELECT id, name, type, serialization_format FROM topics NOT INDEXED ORDER BY id", needed=True
         ):
             if not isinstance(number, int) or not 0 <= number <= 0xFFFE or not isinstance(topic, str):
                 self._report.doubt("a topic's row is damaged")
                 continue
             encoding, text = definitions.get(str(name), ("", ""))
-            if not text and ros_name(str(name)) in stock.fielddefs:
-                encoding, text = "ros2msg", stock.generate_msgdef(ros_name(str(name)), ros_version=2)[0]
+            if not text.strip() and (stock := stock_definition(release or BEFORE_DEFINITIONS, str(name))):
+                encoding, text = "ros2msg", stock
             schema = Schema(id=number + 1, name=str(name), encoding=encoding, data=text.encode())
             channel = Channel(
                 id=number, topic=topic, message_encoding=str(serialization), metadata={}, schema_id=number + 1
@@ -111,67 +152,64 @@ class Db3Salvage:
     # --- messages
 
     def _read(self, database: sqlite3.Connection) -> None:
-        try:
-            low, high = database.execute("SELECT MIN(id), MAX(id) FROM messages").fetchone()
-        except BROKEN as error:
-            low, high = self._ends(database)
-            self._note_damage(error)
-        if low is None:
+        reached = self._forward(database, LOWEST, HIGHEST)
+        if reached is None:
             return
-        pending = [(int(low), int(high))]
+        back = self._backward(database, reached, HIGHEST)
+        if back is None:
+            return
+        pending = [(reached + 1, min(back - 1, self._highest(database)))]
         while pending and self._probes < PROBES:
             first, last = pending.pop()
-            reached = self._forward(database, first, last)
-            if reached is None:
+            if first > last or (reached := self._forward(database, first, last)) is None:
                 continue
             back = self._backward(database, reached, last)
-            if back is None or back <= reached or back - reached < 2:
-                continue
-            middle = (reached + back) // 2
-            pending += [(middle + 1, back), (reached + 1, middle)]
-        if pending:
-            self._report.amount_known = False
+            if back is not None and reached + 1 < back - 1:  # a single row that neither way reaches is given up
+                middle = (reached + back) // 2
+                pending += [(middle + 1, back - 1), (reached + 1, middle)]
 
-    def _ends(self, database: sqlite3.Connection) -> tuple[int | None, int | None]:
-        for order in ("ASC", "DESC"):
-            try:
-                row = database.execute(f"SELECT id FROM messages ORDER BY id {order} LIMIT 1").fetchone()
-            except BROKEN:
-                continue
-            if row is not None:
-                return (row[0], 1 << 40) if order == "ASC" else (0, row[0])
-        return None, None
+    def _highest(self, database: sqlite3.Connection) -> int:
+        """The highest row id there may be, where the end of the table cannot be read: as the index of times says, or as there is room
+        for: recorders count from 1."""
+        highest: int = self._source.size
+        try:
+            (row,) = database.execute("SELECT MAX(rowid) FROM messages INDEXED BY timestamp_idx").fetchall()
+            highest = max(highest, row[0] or 0)
+        except BROKEN:
+            pass
+        return highest
 
     def _forward(self, database: sqlite3.Connection, first: int, last: int) -> int | None:
         """Read rows from `first` up; the last id before damage, or None where `last` was reached."""
-        query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? AND id <= ? ORDER BY id"
         reached = first - 1
         self._probes += 1
         try:
-            for row in database.execute(query, (first, last)):
-                reached = max(reached, row[0])
+            for row in database.execute(_ROWS.format("ASC"), (first, last)):
+                reached = row[0]
                 self._take(*row)
         except BROKEN as error:
             self._note_damage(error)
             return reached
         return None
 
-    def _backward(self, database: sqlite3.Connection, first: int, last: int) -> int | None:
-        """Read rows from `last` down; the id before damage, or None where `first` was reached."""
-        query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? AND id <= ? ORDER BY id DESC"
-        reached = last + 1
+    def _backward(self, database: sqlite3.Connection, reached: int, last: int) -> int | None:
+        """Read rows from `last` down to those above `reached`; the last id before damage (`last` + 1 for none), or None where all
+        were read."""
+        back, held = last + 1, 0
         self._probes += 1
         rows: list[tuple[Any, ...]] = []
         try:
-            for row in database.execute(query, (first, last)):
-                reached = min(reached, row[0])
+            for row in database.execute(_ROWS.format("DESC"), (reached + 1, last)) if reached < last else ():
+                back = row[0]
                 rows.append(row)
-                if len(rows) >= STEP:
+                held += len(row[3]) if isinstance(row[3], bytes) else 0
+                if len(rows) >= STEP or held >= STEP_BYTES:
                     self._take_all(rows)
+                    held = 0
         except BROKEN as error:
             self._note_damage(error)
             self._take_all(rows)
-            return reached
+            return back
         self._take_all(rows)
         return None
 
@@ -181,12 +219,11 @@ class Db3Salvage:
         rows.clear()
 
     def _take(self, number: int, topic_id: Any, time_ns: Any, data: Any) -> None:
-        if number in self._seen:
-            return
         if not isinstance(time_ns, int) or not isinstance(data, bytes) or not isinstance(topic_id, int) or time_ns < 0:
             self._note_damage(ValueError("a row that is no message"))
             return
-        self._seen.add(number)
+        if not self._seen.add(number):
+            return
         if topic_id not in self._channels:
             self._unknown[topic_id] += 1
             return
@@ -196,6 +233,18 @@ class Db3Salvage:
         topic.add(time_ns, time_ns, 1)
         topic.unverified += 1
         self._clean.message(channel_id, MESSAGE_HEAD.pack(channel_id, 0, time_ns, time_ns) + data)
+
+    def _check(self, database: sqlite3.Connection) -> None:
+        """Doubt everything where SQLite's own check finds the file's trees damaged: rows may be missing that no query misses."""
+        try:
+            found = str(database.execute("PRAGMA integrity_check(1)").fetchone()[0]).removeprefix(
+                "*** in database main ***"
+            )
+        except BROKEN as error:
+            found = str(error)
+        if found != "ok":
+            self._damaged = True
+            self._report.doubt(f"SQLite's check of the file fails ({' '.join(found.split())})")
 
     def _note_damage(self, error: BaseException) -> None:
         self._damaged = True

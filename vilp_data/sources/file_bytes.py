@@ -12,6 +12,19 @@ from typing import BinaryIO, Self
 from vilp_data.errors import LogError
 
 WINDOW = 1 << 22  # bytes searched at a time
+HEAD_SIZE = 16  # bytes that tell every format apart
+
+
+def first_bytes(path: Path) -> bytes:
+    """The first HEAD_SIZE bytes of a file, none of a folder; LogError where it cannot be opened."""
+    try:
+        if path.is_dir():
+            next(path.iterdir(), None)
+            return b""
+        with path.open("rb") as stream:
+            return stream.read(HEAD_SIZE)
+    except OSError as error:
+        raise LogError("cannot be opened", where=path, found=error.strerror, remedy="check its permissions") from error
 
 
 class FileBytes:
@@ -51,10 +64,13 @@ class FileBytes:
                 yield begin + match.start(), match[0]
             begin += WINDOW
 
+    def close(self) -> None:
+        self._stream.close()
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stream.close()
+        self.close()

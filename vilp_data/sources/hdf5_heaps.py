@@ -5,7 +5,7 @@ from __future__ import annotations
 import mmap
 from pathlib import Path
 
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, copy_again
 
 SEARCHED_BYTES = 64 << 20
 """How much of a file is searched: texts lie beside the first groups, and a search costs a read."""
@@ -27,7 +27,7 @@ def refuse_damaged_heaps(path: Path) -> None:
             while at >= 0:
                 size = int.from_bytes(data[at + 8 : at + _HEADER], "little")
                 if not _is_whole(data, at, size):
-                    found, remedy = f"at byte {at}", "copy the file again from its source"
+                    found, remedy = f"at byte {at}", copy_again("file")
                     raise LogError("the HDF5 file is damaged: a heap of texts", where=path, found=found, remedy=remedy)
                 at = data.find(_START, at + _HEADER, SEARCHED_BYTES)
 

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,19 +19,20 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from vilp_data.errors import LogError, nearest
+from vilp_data import limits
+from vilp_data.errors import LogError, copy_again, nearest, reason
+from vilp_data.sources.folder_hash import array_bytes, file_sha256
 from vilp_data.sources.hdf5_tree import (
     BROKEN,
-    MAX_CHUNK_BYTES,
     Demonstrations,
     checked_array,
     find_demonstrations,
     open_file,
 )
-from vilp_data.sources.row_clock import RowClock
+from vilp_data.sources.row_clock import RowClock, is_rate
 from vilp_data.types import I64, LogEpisode, Message, TopicInfo
 
-RECOPY = "copy the file again from its source, or leave this demonstration out"
+RECOPY = copy_again("file", leave="this demonstration")
 BLOCK_BYTES = 1 << 20  # rows that are read at a time, at least one chunk of them
 LISTED_ROWS = 5_000_000  # whose times `message_times` gives
 
@@ -79,8 +79,7 @@ class Hdf5Log:
         ] = {}  # topic -> (demonstration, block number, its rows)
 
     def sha256(self) -> str:
-        with self.path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file_sha256(self.path)
 
     def demonstration_sha256(self, name: str) -> str:
         """SHA-256 of one demonstration: when its rows begin, and their values in every array, whatever the chunks and compression.
@@ -98,7 +97,7 @@ class Hdf5Log:
                 checked_array(array, f"{self.path}, {name}/{topic}")
                 step = _block_rows(array)
                 for first in range(0, array.shape[0], step):
-                    digest.update(np.ascontiguousarray(array[first : first + step]).reshape(-1).view(np.uint8).data)
+                    digest.update(array_bytes(np.asarray(array[first : first + step])))
             except (LogError, *BROKEN):
                 digest.update(b"unreadable")
         return digest.hexdigest()
@@ -118,6 +117,12 @@ class Hdf5Log:
             LogEpisode(name, self._clock.time_ns(span.first), self._clock.time_ns(span.stop), self._tags(name))
             for name, span in self._spans.items()
         ]
+
+    def doubts(self) -> list[str]:
+        """Where the file holds fewer rows than it says: robomimic's `total`."""
+        total, there = self._demos.attributes.get("total", ""), sum(span.n_rows for span in self._spans.values())
+        lacks = total.isdecimal() and int(total) > there
+        return [f"data/ counts {int(total):,} rows (its attribute `total`), where {there:,} are"] if lacks else []
 
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
@@ -178,7 +183,7 @@ class Hdf5Log:
         try:
             array = self._demos.array(name, topic)
         except BROKEN as error:
-            raise LogError(f"{topic} cannot be opened", where=where, found=_words(error), remedy=RECOPY) from error
+            raise LogError(f"{topic} cannot be opened", where=where, found=reason(error), remedy=RECOPY) from error
         if array is None:
             others = ", ".join(self._demos.names_of(name)) or "no array"
             raise LogError(
@@ -203,7 +208,7 @@ class Hdf5Log:
             try:
                 rows = np.asarray(array[number * step : (number + 1) * step])
             except BROKEN as error:
-                found = f"rows from {number * step} on: {_words(error)}"
+                found = f"rows from {number * step} on: {reason(error)}"
                 raise LogError(
                     f"{topic} cannot be read", where=f"{self.path}, {name}", found=found, remedy=RECOPY
                 ) from error
@@ -231,18 +236,18 @@ def _block_rows(array: h5py.Dataset) -> int:
     """Rows to read at a time: whole chunks where they fit in memory, BLOCK_BYTES together where rows are small."""
     least: int = array.chunks[0] if array.chunks else 1
     row_bytes: int = max(int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize, 1)
-    if least * row_bytes > MAX_CHUNK_BYTES:  # chunks that are long in rows, and narrow
-        return max(MAX_CHUNK_BYTES // row_bytes, 1)
+    if least * row_bytes > limits.ARRAY_CHUNK_BYTES:  # chunks that are long in rows, and narrow
+        return max(limits.ARRAY_CHUNK_BYTES // row_bytes, 1)
     return least * max(BLOCK_BYTES // (least * row_bytes), 1)
 
 
 def _stated_rate_hz(texts: Mapping[str, str]) -> float | None:
-    """How fast the rows were taken, where an attribute of data/ says it in JSON."""
+    """How fast the rows were taken, where an attribute of data/ says it in JSON, and rows can be as fast as that."""
     for attribute, path in STATED_RATES:
         rate = _json(texts.get(attribute, ""))
         for key in path:
             rate = rate.get(key) if isinstance(rate, dict) else None
-        if isinstance(rate, int | float) and not isinstance(rate, bool) and isfinite(rate) and rate > 0:
+        if isinstance(rate, int | float) and not isinstance(rate, bool) and is_rate(rate):
             return float(rate)
     return None
 
@@ -259,7 +264,3 @@ def _json(text: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         return None
-
-
-def _words(error: BaseException) -> str:
-    return str(error) or repr(error)

@@ -15,18 +15,17 @@ import h5py
 import numpy as np
 
 from vilp_data import limits
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, copy_again, reason
 from vilp_data.sources.hdf5_heaps import refuse_damaged_heaps
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 LAYOUT = "expected the robomimic layout: data/demo_0/actions, data/demo_0/obs/…, data/demo_1/…"
-RECOPY = "copy the file again from its source"
+RECOPY = copy_again("file")
 LEFT_OUT = frozenset({"next_obs"})
 ACTIONS = ("actions", "action")
 MASKS = "mask"
 MODEL = "model_file"
 MAX_ARRAYS = 4096  # of one demonstration
-MAX_CHUNK_BYTES = 256 << 20  # a chunk is inflated whole
 MAX_TAG_LENGTH = 200
 
 # What h5py raises for damaged bytes, besides what it finds at once.
@@ -40,7 +39,7 @@ def open_file(path: Path) -> h5py.File:
     except BROKEN as error:
         cut = "truncated" in str(error)
         what = "the HDF5 file is cut off" if cut else "the HDF5 file cannot be opened"
-        raise LogError(what, where=path, found=str(error) or repr(error), remedy=RECOPY) from error
+        raise LogError(what, where=path, found=reason(error), remedy=RECOPY) from error
     try:
         refuse_damaged_heaps(path)
     except LogError:
@@ -61,9 +60,7 @@ def find_demonstrations(file: h5py.File, path: Path) -> Demonstrations:
             return Demonstrations(path, file, [""], {})
         inside = ", ".join(list(file)[:8]) or "nothing"
     except BROKEN as error:
-        raise LogError(
-            "the HDF5 file is damaged", where=path, found=str(error) or repr(error), remedy=RECOPY
-        ) from error
+        raise LogError("the HDF5 file is damaged", where=path, found=reason(error), remedy=RECOPY) from error
     raise LogError("no demonstrations in this HDF5 file", where=path, found=f"at its root: {inside}", remedy=LAYOUT)
 
 
@@ -165,7 +162,7 @@ class Demonstrations:
             try:
                 self._lengths[name] = self._find_length(name)
             except BROKEN as error:
-                where, found = f"{self._path}, {name}", str(error) or repr(error)
+                where, found = f"{self._path}, {name}", reason(error)
                 raise LogError("the demonstration is damaged", where=where, found=found, remedy=RECOPY) from error
         return self._lengths[name]
 
@@ -186,7 +183,7 @@ def checked_array(array: h5py.Dataset, where: str) -> None:
     try:
         _check_array(array, where)
     except BROKEN as error:
-        raise LogError("the array is damaged", where=where, found=str(error) or repr(error), remedy=RECOPY) from error
+        raise LogError("the array is damaged", where=where, found=reason(error), remedy=RECOPY) from error
 
 
 def _check_array(array: h5py.Dataset, where: str) -> None:
@@ -198,9 +195,8 @@ def _check_array(array: h5py.Dataset, where: str) -> None:
     if array.size == 0:
         return
     shape = array.chunks or array.shape[1:]
-    if (size := int(np.prod(shape, dtype=object)) * array.dtype.itemsize) > MAX_CHUNK_BYTES:
-        found = f"{'chunks' if array.chunks else 'rows'} of {shape} {array.dtype}, {size / 1e6:.0f} MB each"
-        raise LogError("too much to read at a time", where=where, found=found, remedy="write it in smaller chunks")
+    what = f"{'a chunk' if array.chunks else 'a row'} of {shape} {array.dtype}"
+    limits.check(what, "ARRAY_CHUNK_BYTES", int(np.prod(shape, dtype=object)) * array.dtype.itemsize, where=where)
     if array.chunks:
         expected = int(np.prod([-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True)], dtype=object))
         written = array.id.get_num_chunks()

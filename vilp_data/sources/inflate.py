@@ -7,14 +7,21 @@ from __future__ import annotations
 
 import bz2
 import struct
+from io import BytesIO
 from typing import NamedTuple, Protocol
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
+from vilp_data import limits
+
 STEP = 1 << 18  # bytes inflated at a time
 LARGEST_WINDOW = 1 << 27  # what zstd looks back on, 128 MB: also what its own command line allows
 AT_ONCE = 1 << 26  # a zstd frame up to this size is inflated by one call, which allocates what the header claims
+UNKNOWN_SIZE, UNKNOWN_RATIO = (
+    1 << 26,
+    16,
+)  # what a chunk whose size nothing tells may inflate to, at the least, and per packed byte
 UNFINISHED = "the compressed data have no end"
 LZ4_BLOCK_BYTES = {4: 1 << 16, 5: 1 << 18, 6: 1 << 20, 7: 1 << 22}
 
@@ -29,10 +36,37 @@ class Inflated(NamedTuple):
     fault: str
 
 
+class _Prefix:
+    """Up to `size` bytes that come out piece by piece, held once: the buffer grows, and is handed out as it is."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._buffer = BytesIO()
+        self.full = False
+
+    def add(self, part: bytes) -> None:
+        """Note what came out; `full` once it is more than `size`."""
+        room = self._size - self._buffer.tell()
+        self.full = self.full or len(part) > room
+        self._buffer.write(part if len(part) <= room else part[:room])
+
+    def too_many(self) -> str:
+        return f"more than {self._size} bytes where the header says {self._size}"
+
+    def data(self) -> bytes:
+        return self._buffer.getvalue()
+
+
 class _Stream(Protocol):
     @property
     def eof(self) -> bool: ...
     def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
+
+
+def largest_guess(packed_size: int) -> int:
+    """Bytes that a chunk may inflate to whose own word about it is missing or wrong: more than recorders' chunks have, and little
+    beside the file itself."""
+    return min(limits.CHUNK_BYTES, max(UNKNOWN_SIZE, UNKNOWN_RATIO * packed_size))
 
 
 def inflate(packed: bytes, compression: str, size: int) -> bytes:
@@ -84,22 +118,19 @@ def _zstd_at_once(packed: bytes, size: int) -> bytes:
 def _zstd_prefix(packed: bytes, size: int) -> Inflated:
     """Block by block, since an error takes with it whatever the same call has inflated."""
     stream = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW).decompressobj()
-    parts: list[bytes] = []
-    length = position = 0
+    out, position = _Prefix(size), 0
     try:
-        while position < len(packed) and length <= size:
+        while position < len(packed) and not out.full:
             end = _zstd_block_end(packed, position)
-            part = stream.decompress(packed[position:end])
-            parts.append(part)
-            length += len(part)
+            out.add(stream.decompress(packed[position:end]))
             position = end
             if stream.eof and position < len(packed):
                 stream = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW).decompressobj()  # frames may follow
         fault = UNFINISHED if not stream.eof else ""
-        fault = fault if position == len(packed) else f"more than {size} bytes where the header says {size}"
+        fault = fault if position == len(packed) and not out.full else out.too_many()
     except BROKEN as error:
         fault = str(error)
-    return Inflated(b"".join(parts)[:size], fault)
+    return Inflated(out.data(), fault)
 
 
 def _zstd_block_end(packed: bytes, position: int) -> int:
@@ -117,22 +148,19 @@ def _zstd_block_end(packed: bytes, position: int) -> int:
 
 def _stream_prefix(stream: _Stream, packed: bytes, size: int) -> Inflated:
     """Through a decompressor that stops at a length."""
-    parts: list[bytes] = []
-    length = position = 0
+    out, position = _Prefix(size), 0
     try:
-        while not stream.eof and length <= size:
+        while not stream.eof and not out.full:
             piece = packed[position : position + STEP] if getattr(stream, "needs_input", True) else b""
             part = stream.decompress(piece, max_length=STEP)
             position += len(piece)
-            parts.append(part)
-            length += len(part)
+            out.add(part)
             if not part and position >= len(packed) and not stream.eof:
                 break
     except BROKEN as error:
-        return Inflated(b"".join(parts)[:size], str(error) or type(error).__name__)
-    fault = UNFINISHED if not stream.eof else ""
-    fault = f"more than {size} bytes where the header says {size}" if length > size else fault
-    return Inflated(b"".join(parts)[:size], fault)
+        return Inflated(out.data(), str(error) or type(error).__name__)
+    fault = out.too_many() if out.full else UNFINISHED if not stream.eof else ""
+    return Inflated(out.data(), fault)
 
 
 def _lz4_prefix(packed: bytes, size: int) -> Inflated:

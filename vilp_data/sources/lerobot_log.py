@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Iterator
 from contextlib import closing
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from vilp_data.errors import LogError, nearest
-from vilp_data.sources.folder_hash import folder_sha256
+from vilp_data.sources.folder_hash import array_bytes, folder_sha256
 from vilp_data.sources.lerobot_meta import EpisodeMeta, read_meta
 from vilp_data.sources.lerobot_table import EpisodeTable
 from vilp_data.sources.row_clock import RowClock
@@ -27,7 +28,7 @@ SCHEMAS = {"video": "array", "numbers": "array", "image": "foxglove.CompressedIm
 LISTED_ROWS = 100_000  # whose times `message_times` looks up
 LOOKED_AT = 50  # episodes in which `first_messages` looks for a topic
 REWRITE = "leave this episode out, or write the dataset again: timestamp = frame_index / fps"
-SHOWN_INFO = ("codebase_version", "robot_type", "fps", "total_episodes", "total_frames")
+SHOWN_INFO = ("codebase_version", "robot_type", "fps")  # not its totals: the list of episodes tells what is there
 
 
 class LeRobotLog:
@@ -65,7 +66,7 @@ class LeRobotLog:
                     digest.update(f"{feature.name} {feature.kind} {feature.shape};".encode())
                     if feature.kind != "video":
                         for row in table.rows([feature], 0, table.n_rows):
-                            digest.update(_bytes_of(row[feature.name]))
+                            digest.update(_row_bytes(row[feature.name]))
         except LogError:
             digest.update(b"unreadable")
         length_ns = self._clock.time_ns(episode.n_rows)
@@ -79,19 +80,25 @@ class LeRobotLog:
         return digest.hexdigest()
 
     def topics(self) -> list[TopicInfo]:
-        return [
-            TopicInfo(name, SCHEMAS[feature.kind], "video" if feature.kind == "video" else "parquet", self._n_rows)
-            for name, feature in sorted(self._meta.features.items())
-        ]
+        """Every feature, with the rows of the episodes whose table (and video, where it is one) is there."""
+        found = []
+        for name, feature in sorted(self._meta.features.items()):
+            count = sum(episode.n_rows for episode in self._meta.episodes if self._has(episode, name))
+            encoding = "video" if feature.kind == "video" else "parquet"
+            found.append(TopicInfo(name, SCHEMAS[feature.kind], encoding, count))
+        return found
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """`info`: what meta/info.json says of the whole. `names`: the names of the numbers in each feature, with commas between.
-        `missing files`: of how many episodes the table, or a video, is not there."""
+        """`info`: what meta/info.json says of the whole. `names`: the names of the numbers in each feature, with commas between."""
         info = {key: str(self._meta.info[key]) for key in SHOWN_INFO if self._meta.info.get(key) is not None}
         named = {name: feature for name, feature in self._meta.features.items() if feature.kind == "numbers"}
         names = {name: ", ".join(feature.names) for name, feature in named.items() if feature.names}
-        absent = {"missing files": missing} if (missing := self._missing()) else {}
-        return {"info": info} | ({"names": names} if names else {}) | absent
+        return {"info": info} | ({"names": names} if names else {})
+
+    @property
+    def n_whole(self) -> int:
+        """How many of the episodes have all their files."""
+        return sum(all(self._has(episode, name) for name in self._meta.features) for episode in self._meta.episodes)
 
     def episodes(self) -> list[LogEpisode]:
         return [
@@ -99,6 +106,16 @@ class LeRobotLog:
                 name, self._clock.time_ns(before), self._clock.time_ns(before + episode.n_rows), self._tags(episode)
             )
             for name, (episode, before) in self._episodes.items()
+        ]
+
+    def doubts(self) -> list[str]:
+        """Where meta/ counts other episodes than it lists, and of how many the table or a video is not there."""
+        found, episodes = self._meta.doubts(), self._meta.episodes
+        missing = {"table": sum(episode.table not in self._files for episode in episodes)}
+        for key in sorted({key for episode in episodes for key in episode.videos}):
+            missing[f"video {key}"] = sum(episode.videos[key].path not in self._files for episode in episodes)
+        return found + [
+            f"{count} of {len(episodes)} episodes lack their {name}" for name, count in missing.items() if count
         ]
 
     def messages(
@@ -151,14 +168,17 @@ class LeRobotLog:
     ) -> None:
         return
 
-    def _missing(self) -> dict[str, str]:
+    @cached_property
+    def _files(self) -> set[str]:
+        """Of the files that meta/ names those that are there."""
         episodes = self._meta.episodes
-        paths = {"table": [episode.table for episode in episodes]}
-        videos = sorted({key for episode in episodes for key in episode.videos})
-        paths |= {key: [episode.videos[key].path for episode in episodes] for key in videos}
-        there = {path: (self.path / path).is_file() for path in {path for listed in paths.values() for path in listed}}
-        counts = {name: sum(not there[path] for path in listed) for name, listed in paths.items()}
-        return {name: f"{count} of {len(episodes)} episodes" for name, count in counts.items() if count}
+        named = {episode.table for episode in episodes}
+        named |= {part.path for episode in episodes for part in episode.videos.values()}
+        return {path for path in named if (self.path / path).is_file()}
+
+    def _has(self, episode: EpisodeMeta, feature: str) -> bool:
+        video = episode.videos.get(feature)
+        return episode.table in self._files and (video is None or video.path in self._files)
 
     # --- reading ---
 
@@ -231,7 +251,7 @@ def _snapped(timestamps_s: F64, fps: float) -> F64:
         return np.where(np.abs(timestamps_s - exact) <= rounding, exact, timestamps_s)
 
 
-def _bytes_of(value: Any) -> bytes | memoryview:
+def _row_bytes(value: Any) -> bytes | memoryview:
     if isinstance(value, dict):
         return bytes(value["data"])
-    return value.encode() if isinstance(value, str) else np.ascontiguousarray(value).reshape(-1).view(np.uint8).data
+    return value.encode() if isinstance(value, str) else array_bytes(np.asarray(value))

@@ -17,9 +17,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, copy_again, reason
+from vilp_data.sources.row_clock import is_rate
 
-RECOPY = "copy the folder meta/ again from its source"
+RECOPY = copy_again("folder meta/")
 BOOKKEEPING = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index"})
 """Columns that count rows rather than measure anything: no topics."""
 
@@ -69,7 +70,7 @@ class EpisodeMeta:
 
 @dataclass(frozen=True)
 class DatasetMeta:
-    """A whole dataset. `info` is meta/info.json; `episodes` in order of their index."""
+    """A whole dataset. `info` is meta/info.json; `episodes` in order of their index, as far as the list of episodes goes."""
 
     version: str
     fps: float
@@ -77,6 +78,24 @@ class DatasetMeta:
     features: Mapping[str, Feature]
     episodes: tuple[EpisodeMeta, ...]
     info: Mapping[str, Any]
+
+    def doubts(self) -> list[str]:
+        """Where the list of episodes is shorter than meta/info.json counts, or numbers are left out of it."""
+        found = []
+        last = self.episodes[-1].index if self.episodes else -1
+        if (holes := last + 1 - len(self.episodes)) > 0:
+            first = next(place for place, episode in enumerate(self.episodes) if place != episode.index)
+            found.append(f"the list of episodes leaves out {holes:,} of them, from episode {first} on")
+        listed = {
+            "total_episodes": len(self.episodes),
+            "total_frames": sum(episode.n_rows for episode in self.episodes),
+        }
+        for name, count in listed.items():
+            stated = self.info.get(name)
+            if isinstance(stated, int) and stated != count:
+                what = name.removeprefix("total_")
+                found.append(f"meta/info.json counts {stated:,} {what}, the list of episodes holds {count:,}")
+        return found
 
 
 def is_lerobot(path: Path) -> bool:
@@ -91,15 +110,15 @@ def read_meta(root: Path) -> DatasetMeta:
         version, fps = str(info["codebase_version"]), float(info["fps"])
         features = {name: _feature(name, table) for name, table in info["features"].items() if name not in BOOKKEEPING}
     except _TYPES as error:
-        raise LogError("meta/info.json cannot be used", where=root, found=_words(error), remedy=RECOPY) from error
-    if not (isfinite(fps) and 0 < fps <= 100_000):
+        raise LogError("meta/info.json cannot be used", where=root, found=reason(error), remedy=RECOPY) from error
+    if not is_rate(fps):
         raise LogError(
             "meta/info.json states no rate", where=root, found=f"fps {fps}", remedy="state fps in meta/info.json"
         )
     try:
         episodes = tuple(sorted(_episodes(root, version, info, features), key=lambda episode: episode.index))
     except _TYPES as error:
-        raise LogError("the list of episodes cannot be used", where=root, found=_words(error), remedy=RECOPY) from error
+        raise LogError("the list of episodes cannot be used", where=root, found=reason(error), remedy=RECOPY) from error
     _check(root, episodes)
     robot = info.get("robot_type")
     return DatasetMeta(version, fps, robot if isinstance(robot, str) else None, features, episodes, info)
@@ -147,7 +166,7 @@ def _episodes_v2(root: Path, info: Mapping[str, Any], videos: list[str]) -> Iter
                 index, n_rows = int(row["episode_index"]), int(row["length"])
                 tasks = tuple(map(str, row.get("tasks") or ()))
             except _TYPES as error:
-                found = f"line {number}: {_words(error)}"
+                found = f"line {number}: {reason(error)}"
                 raise LogError("meta/episodes.jsonl cannot be read", where=root, found=found, remedy=RECOPY) from error
             places: dict[str, int | str] = {"episode_index": index, "episode_chunk": index // chunk_size}
             parts = {key: VideoPart(_path(info["video_path"], places | {"video_key": key}), 0.0) for key in videos}
@@ -205,7 +224,3 @@ def _check(root: Path, episodes: tuple[EpisodeMeta, ...]) -> None:
     if bad := [episode for episode in episodes if episode.index < 0 or not 0 <= episode.n_rows < MAX_ROWS]:
         found = f"episode {bad[0].index} of {bad[0].n_rows} rows"
         raise LogError("the list of episodes holds impossible numbers", where=root, found=found, remedy=RECOPY)
-
-
-def _words(error: BaseException) -> str:
-    return f"no {error}" if isinstance(error, KeyError) else str(error) or repr(error)

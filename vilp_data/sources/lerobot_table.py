@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vilp_data.errors import LogError
+from vilp_data import limits
+from vilp_data.errors import LogError, copy_again, reason
 from vilp_data.sources.lerobot_meta import EpisodeMeta, Feature
 from vilp_data.types import F64, I64
 
-RECOPY = "copy the file again from its source, or leave this episode out"
+RECOPY = copy_again("file", leave="this episode")
 MAX_FILE_ROWS = 100_000_000
-BATCH_ROWS, BATCH_IMAGES = 1024, 8
+BATCH_ROWS, BATCH_IMAGES = 1024, 8  # at most
+BATCH_BYTES = 16 << 20
 BROKEN = (pa.ArrowException, OSError, KeyError, ValueError, TypeError, IndexError, OverflowError, MemoryError)
 
 
@@ -48,7 +51,7 @@ class EpisodeTable:
             raise
         except BROKEN as error:
             self.close()
-            raise LogError("the table cannot be read", where=self._where, found=_words(error), remedy=RECOPY) from error
+            raise LogError("the table cannot be read", where=self._where, found=reason(error), remedy=RECOPY) from error
 
     def close(self) -> None:
         if hasattr(self, "_file"):
@@ -61,8 +64,8 @@ class EpisodeTable:
         if not features:
             yield from ({} for _ in range(first, stop))
             return
-        batch_rows = BATCH_IMAGES if any(feature.kind == "image" for feature in features) else BATCH_ROWS
         try:
+            batch_rows = self._batch_rows(features)
             for batch in self._batches([feature.name for feature in features], first, stop, batch_rows):
                 columns = {
                     feature.name: _values(batch.column(feature.name), feature, self._where) for feature in features
@@ -70,7 +73,14 @@ class EpisodeTable:
                 for row in range(batch.num_rows):
                     yield {name: values[row] for name, values in columns.items()}
         except BROKEN as error:
-            raise LogError("the table cannot be read", where=self._where, found=_words(error), remedy=RECOPY) from error
+            raise LogError("the table cannot be read", where=self._where, found=reason(error), remedy=RECOPY) from error
+
+    def _batch_rows(self, features: Sequence[Feature]) -> int:
+        """Rows to read at a time, by the numbers that meta/ states for each; LogError where limits.ARRAY_CHUNK_BYTES do not hold a row."""
+        row_bytes = 8 * sum(prod(feature.shape) for feature in features if feature.kind == "numbers")
+        limits.check("a row of the table", "ARRAY_CHUNK_BYTES", row_bytes, where=self._where)
+        most = BATCH_IMAGES if any(feature.kind == "image" for feature in features) else BATCH_ROWS
+        return max(min(most, BATCH_BYTES // max(row_bytes, 1)), 1)
 
     def _find_rows(self, episode: EpisodeMeta) -> int:
         """The first of the episode's rows in the file, by its own column `episode_index`, which must agree with meta/."""
@@ -87,7 +97,7 @@ class EpisodeTable:
 
     def _column(self, name: str) -> I64:
         if name not in self._file.schema_arrow.names:
-            raise KeyError(name)
+            raise ValueError(f"no column {name!r}")
         return np.asarray(self._file.read(columns=[name]).column(name).to_numpy(), np.int64)
 
     def _batches(self, names: list[str], first: int, stop: int, batch_rows: int) -> Iterator[pa.RecordBatch]:
@@ -160,7 +170,3 @@ def _image(cell: Any, feature: Feature, where: str) -> dict[str, Any]:
         remedy = "embed the images' bytes (lerobot and datasets do so when they save)"
         raise LogError(f"{feature.name} holds no image", where=where, found=found, remedy=remedy)
     return {"format": "png" if data.startswith(b"\x89PNG") else "jpeg", "data": data}
-
-
-def _words(error: BaseException) -> str:
-    return f"no column {error}" if isinstance(error, KeyError) else (str(error) or repr(error)).partition("\n")[0]

@@ -11,11 +11,12 @@ import zlib
 from collections.abc import Iterator
 from itertools import combinations
 from math import comb
-from typing import NamedTuple
+from typing import BinaryIO
 
 import zstandard
 from mcap.opcode import Opcode
 
+from vilp_data.sources.file_bytes import FileBytes
 from vilp_data.sources.inflate import UNFINISHED, inflate, inflate_prefix
 from vilp_data.sources.mcap_records import CHUNK_HEAD, MAGIC, RECORD_HEAD
 
@@ -24,7 +25,8 @@ FED = (b"\x89MCAP0\n",)
 MOST_TRIALS = 20_000
 """Ways to put returns back into one zstd block or chunk; beyond that it is left as it is."""
 LARGEST_CHUNK = 1 << 26
-"""Of chunks that are tried."""
+"""Of chunks that are tried, as they are and inflated."""
+BLOCK = 1 << 20
 MOST_BYTES = 1 << 34
 """Inflated for trials, of the whole log: half a minute."""
 
@@ -40,100 +42,103 @@ class _Budget:
         return self.left > 0
 
 
-class Restored(NamedTuple):
-    """The log's bytes as they were, or as near as can be had; `what` says in words what was done."""
-
-    data: bytes
-    what: str
-
-
 def is_converted(head: bytes) -> bool:
     """Whether a log that begins with these bytes went through a conversion of line endings."""
     return head.startswith(RETURNED) or head.startswith(FED)
 
 
-def restored(data: bytes) -> Restored:
-    """The log before the conversion; `data` begins as `is_converted` says."""
-    if data.startswith(RETURNED):
-        lone = data.replace(b"\r\n", b"").count(b"\n")
-        what = "its line feeds had become pairs (\\r\\n): turned back"
-        if lone:
-            what += f"; {lone} line feeds were not converted, so not every pair need have been a line feed"
-        return Restored(data.replace(b"\r\n", b"\n"), what)
-    return _with_returns(data)
+def restore(source: FileBytes, out: BinaryIO) -> str:
+    """Write the log before the conversion, or as near as can be had; what was done, in words. `source` begins as `is_converted` says."""
+    return _without_returns(source, out) if source.at(0, 16).startswith(RETURNED) else _with_returns(source, out)
+
+
+# --- line feeds that became pairs ---------------------------------------------------------------------------------------------
+
+
+def _without_returns(source: FileBytes, out: BinaryIO) -> str:
+    lone, kept = 0, b""
+    for begin in range(0, source.size, BLOCK):
+        block = kept + source.at(begin, BLOCK)
+        kept = b"\r" if block.endswith(b"\r") else b""  # its line feed may begin the next block
+        block = block.removesuffix(kept)
+        lone += block.count(b"\n") - block.count(b"\r\n")
+        out.write(block.replace(b"\r\n", b"\n"))
+    out.write(kept)
+    what = "its line feeds had become pairs (\\r\\n): turned back"
+    return what + (
+        f"; {lone} line feeds were not converted, so not every pair need have been a line feed" if lone else ""
+    )
 
 
 # --- pairs that became line feeds ---------------------------------------------------------------------------------------------
 
 
-def _with_returns(data: bytes) -> Restored:
+def _with_returns(source: FileBytes, out: BinaryIO) -> str:
     """An MCAP file whose pairs became line feeds, its chunks made whole again by trial."""
-    out = bytearray(MAGIC)
+    out.write(MAGIC)
     position, found, budget = len(FED[0]), 0, _Budget()
-    while position < len(data):
-        chunk = _chunk_at(data, position, budget)
-        if chunk is not None:
+    while position < source.size:
+        if (chunk := _chunk_at(source, position, budget)) is not None:
             record, position = chunk
-            out += record
+            out.write(record)
             found += 1
             continue
-        told = _record_length(data, position)
-        if told is None:
-            out += data[position:]
-            break
-        length, lacks = told
-        if (
-            not lacks or data[position] != Opcode.MESSAGE_INDEX
-        ):  # an index that lacks bytes is worth nothing, and made anew
-            out += data[position : position + length]
+        told = _record_length(source, position)
+        length, lacks = told if told is not None else (source.size - position, 0)
+        # An index that lacks bytes is worth nothing, and made anew.
+        if not lacks or source.at(position, 1)[0] != Opcode.MESSAGE_INDEX:
+            for begin in range(position, position + length, BLOCK):
+                out.write(source.at(begin, min(BLOCK, position + length - begin)))
         position += length
-    what = f"its pairs \\r\\n had become line feeds: {found} chunks made whole again, as their checksums say"
-    return Restored(bytes(out), what)
+    return f"its pairs \\r\\n had become line feeds: {found} chunks made whole again, as their checksums say"
 
 
-def _record_length(data: bytes, position: int) -> tuple[int, int] | None:
+def _record_length(source: FileBytes, position: int) -> tuple[int, int] | None:
     """(length, returns that it lacks) of the record here: as many as it takes that another record follows."""
-    if position + RECORD_HEAD.size > len(data):
+    head = source.at(position, RECORD_HEAD.size)
+    if len(head) < RECORD_HEAD.size:
         return None
-    opcode, length = RECORD_HEAD.unpack_from(data, position)
-    if not 0 < opcode < 16 or length > len(data):
+    opcode, length = RECORD_HEAD.unpack(head)
+    if not 0 < opcode < 16 or length > source.size:
         return None
     for missing in range(3):
         end = position + RECORD_HEAD.size + length - missing
-        if _follows(data, end):
+        if _follows(source, end):
             return int(end - position), missing
     return None
 
 
-def _follows(data: bytes, end: int) -> bool:
+def _follows(source: FileBytes, end: int) -> bool:
     """Whether a record head, or the end of the file, is here."""
-    if end == len(data) or data[end:] in (MAGIC, FED[0]):
+    head = source.at(end, RECORD_HEAD.size)
+    if end == source.size or head in (MAGIC, FED[0]):
         return True
-    head = data[end : end + RECORD_HEAD.size]
     if len(head) < RECORD_HEAD.size:
         return False
     opcode, length = RECORD_HEAD.unpack(head)
-    return bool(0 < opcode < 16 and 0 < length <= len(data))
+    return bool(0 < opcode < 16 and 0 < length <= source.size)
 
 
-def _chunk_at(data: bytes, position: int, budget: _Budget) -> tuple[bytes, int] | None:
+def _chunk_at(source: FileBytes, position: int, budget: _Budget) -> tuple[bytes, int] | None:
     """The chunk record here with its returns, and where the next record begins; None where it is none, or no trial is right."""
-    if position + CHUNK_HEAD.size + 12 > len(data) or data[position] != 6:
+    head = source.at(position, CHUNK_HEAD.size + 12)
+    if len(head) < CHUNK_HEAD.size + 12 or head[0] != Opcode.CHUNK:
         return None
-    _, length, _, _, size, crc, name_length = CHUNK_HEAD.unpack_from(data, position)
-    at = position + CHUNK_HEAD.size + name_length
-    name = data[position + CHUNK_HEAD.size : at]
-    if name not in (b"", b"lz4", b"zstd") or not crc or length > len(data):
+    _, _, _, _, size, crc, name_length = CHUNK_HEAD.unpack_from(head)
+    at = CHUNK_HEAD.size + name_length
+    name = head[CHUNK_HEAD.size : at]
+    if name not in (b"", b"lz4", b"zstd") or not crc:
         return None
-    packed_size = int.from_bytes(data[at : at + 8], "little")
-    head, begin = data[position : at + 8], at + 8
+    packed_size, begin = int.from_bytes(head[at : at + 8], "little"), position + at + 8
+    if max(packed_size, size) > LARGEST_CHUNK:
+        return None
     for missing in range(64):
         end = begin + packed_size - missing
-        if end < begin or not _follows(data, end):
+        if end < begin or not _follows(source, end):
             continue
-        packed = _completed(data[begin:end], missing, name.decode(), size, crc, budget)
+        packed = _completed(source.at(begin, end - begin), missing, name.decode(), size, crc, budget)
         if packed is not None:
-            return head + packed, end
+            return head[: at + 8] + packed, end
     return None
 
 
@@ -169,8 +174,6 @@ def _with_pairs(packed: bytes, places: tuple[int, ...]) -> bytes:
 
 def _zstd_trials(packed: bytes, missing: int, size: int, budget: _Budget) -> Iterator[bytes]:
     """Block by block: a block's header says how long it was, and most wrong trials do not inflate."""
-    if size > LARGEST_CHUNK:
-        return
     try:
         start = zstandard.frame_header_size(packed[:18])
     except zstandard.ZstdError:

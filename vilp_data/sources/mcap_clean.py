@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import BinaryIO
 
 import zstandard
@@ -31,12 +31,41 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from vilp_data.errors import LogError
 from vilp_data.sources.mcap_records import MAGIC, MESSAGE_HEAD, RECORD_HEAD
 
+HIGHEST_ID = 0xFFFF  # of channels and schemas
 CHUNK_BYTES = 1 << 20  # of rescued messages, which are packed anew
 
 # Channel id -> (log time in ns, offset in the chunk) of each of its messages, in file order.
 Entries = Mapping[int, Sequence[tuple[int, int]]]
+
+
+class _Numbers:
+    """Which id stands for what: the one that the source gave, where that stands for nothing else; else one from the top down, which
+    recorders never reach. LogError where none is left."""
+
+    def __init__(self) -> None:
+        self._said: dict[int, Hashable] = {}
+        self._ids: dict[Hashable, int] = {}
+        self._next = HIGHEST_ID
+
+    def of(self, wanted: int, said: Hashable) -> int:
+        """The id of what is `said`."""
+        if self._said.setdefault(wanted, said) == said:
+            self._ids.setdefault(said, wanted)
+            return wanted
+        if said not in self._ids:
+            while self._next in self._said:
+                self._next -= 1
+            if self._next < 1:
+                remedy = "it is damaged or hostile beyond what can be told apart; look for another copy"
+                raise LogError(
+                    "more channels or schemas than an MCAP file can hold", found=f"above {HIGHEST_ID:,}", remedy=remedy
+                )
+            self._said[self._next] = said
+            self._ids[said] = self._next
+        return self._ids[said]
 
 
 class CleanMcap:
@@ -49,6 +78,7 @@ class CleanMcap:
         self._buffer = bytearray()
         self._entries: dict[int, list[tuple[int, int]]] = {}
         self._compressor = zstandard.ZstdCompressor()
+        self._numbers, self._schema_numbers = _Numbers(), _Numbers()
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._written: set[int] = set()  # channels that the file describes already
@@ -64,17 +94,21 @@ class CleanMcap:
         self._write_record(Header(profile, library))
 
     def describe(self, channel: Channel, schema: Schema | None) -> int:
-        """Make a channel known, and its schema (None: it has none); returns the id that its messages bear in this file."""
+        """Make a channel known, and its schema (None: it has none); returns the id that its messages bear in this file.
+
+        LogError where there are more channels than MCAP has ids for."""
         schema_id = 0 if schema is None else self._schema_id(schema)
-        wanted = _channel(channel, channel.id, schema_id)
-        known = self.channels.get(channel.id)
-        if known is not None and known != wanted:
-            for other in self.channels.values():
-                if _channel(other, channel.id, other.schema_id) == wanted:
-                    return int(other.id)
-            wanted = _channel(channel, _free(self.channels), schema_id)
-        self.channels[wanted.id] = wanted
-        return int(wanted.id)
+        said = (channel.topic, channel.message_encoding, tuple(sorted(channel.metadata.items())), schema_id)
+        number = self._numbers.of(channel.id, said)
+        if number not in self.channels:
+            self.channels[number] = Channel(
+                id=number,
+                topic=channel.topic,
+                message_encoding=channel.message_encoding,
+                metadata=dict(channel.metadata),
+                schema_id=schema_id,
+            )
+        return number
 
     def message(self, channel_id: int, content: bytes) -> None:
         """One message record's content; its channel id is replaced by `channel_id`, the rest copied."""
@@ -172,16 +206,10 @@ class CleanMcap:
         )
 
     def _schema_id(self, schema: Schema) -> int:
-        known = self.schemas.get(schema.id)
-        if known is None or known == schema:
-            self.schemas[schema.id] = schema
-            return int(schema.id)
-        for other in self.schemas.values():
-            if (other.name, other.encoding, other.data) == (schema.name, schema.encoding, schema.data):
-                return int(other.id)
-        new = _free(self.schemas)
-        self.schemas[new] = Schema(id=new, name=schema.name, encoding=schema.encoding, data=schema.data)
-        return new
+        number = self._schema_numbers.of(schema.id, (schema.name, schema.encoding, schema.data))
+        if number not in self.schemas:
+            self.schemas[number] = Schema(id=number, name=schema.name, encoding=schema.encoding, data=schema.data)
+        return number
 
     def _make_known(self, channel_id: int) -> None:
         """Describe a channel in the data section, before the first message of it."""
@@ -239,18 +267,3 @@ class CleanMcap:
         self._stream.write(data)
         self._crc = zlib.crc32(data, self._crc)
         self._position += len(data)
-
-
-def _channel(channel: Channel, channel_id: int, schema_id: int) -> Channel:
-    return Channel(
-        id=channel_id,
-        topic=channel.topic,
-        message_encoding=channel.message_encoding,
-        metadata=dict(channel.metadata),
-        schema_id=schema_id,
-    )
-
-
-def _free(taken: Mapping[int, object]) -> int:
-    """The lowest id above those taken; MCAP allows 65,535."""
-    return max(taken) + 1 if max(taken) < 0xFFFF else min(set(range(1, 0x10000)) - taken.keys())

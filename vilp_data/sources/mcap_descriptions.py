@@ -14,7 +14,7 @@ from vilp_data.sources.mcap_records import CHUNK_HEAD
 
 
 class Descriptions:
-    """Schemas and channels: those met on the way, else the summary's; at the `last_chance` those of damaged chunks too.
+    """Schemas and channels: those met on the way, else the summary's; in the end those of damaged chunks too.
 
     A verified summary outranks what lies further up. `unsure`: channels described outside all checksums; `doubted`: only where a
     checksum fails."""
@@ -30,7 +30,11 @@ class Descriptions:
         self._out: dict[int, int] = {}  # channel id here -> its id in the clean file
         self.unsure: set[int] = set()
         self.doubted: set[int] = set()
-        self.last_chance = False
+        self._all_seen = False
+
+    def believe_damaged_chunks(self) -> None:
+        """Every description there is has been seen: what damaged chunks alone describe is taken from there."""
+        self._all_seen = True
 
     def channel_ids(self) -> set[int]:
         return self._channels.keys() | self._hints.channels.keys() | self._weak_channels.keys()
@@ -69,7 +73,7 @@ class Descriptions:
             return self._out[channel_id]
         channel = self._channels.get(channel_id) or self._hints.channels.get(channel_id)
         schemas = self._hints.schemas | self._schemas
-        if self.last_chance:
+        if self._all_seen:
             schemas = self._weak_schemas | schemas
             if channel is None and channel_id in self._weak_channels:
                 channel = self._weak_channels[channel_id]
@@ -78,7 +82,7 @@ class Descriptions:
             return None
         schema = schemas.get(channel.schema_id)
         if channel.schema_id and schema is None:
-            if not self.last_chance:
+            if not self._all_seen:
                 return None
             lost = f"{channel.topic}: its schema is lost; its messages are kept, and nothing says how to read them"
             self._report.doubt(lost)
@@ -94,7 +98,7 @@ class Descriptions:
         return channel.topic, self._clean.schemas[channel.schema_id].name if channel.schema_id else ""
 
 
-def told_chunk(source: FileBytes, position: int, hints: Hints, channels: set[int]) -> ChunkHead | None:
+def recovered_chunk_head(source: FileBytes, position: int, hints: Hints, channels: set[int]) -> ChunkHead | None:
     """The chunk whose record's head or header is damaged: by a verified index, by the size in its header though its length is
     damaged, or by its length though the size is. None where nothing tells."""
     index = hints.chunks.get(position) if hints.verified else None

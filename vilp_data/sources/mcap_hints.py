@@ -35,6 +35,10 @@ class Hints:
     damaged: bool = False
     data_is_intact: bool | None = None
 
+    def clear(self) -> None:
+        """Forget all of it: what follows is another log."""
+        self.__dict__.update(Hints().__dict__)
+
     @property
     def chunk_places(self) -> set[int] | None:
         return set(self.chunks) if self.verified and self.chunks else None

@@ -10,31 +10,22 @@ import struct
 import zlib
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
-from vilp_data.errors import LogError
-from vilp_data.sources.mcap_records import CHUNK_HEAD, LAST_NS, MAGIC, MESSAGE_HEAD, RECORD_HEAD, RECOVER, RecordReader
+from vilp_data.errors import LogError, copy_or_salvage
+from vilp_data.sources.mcap_loose import FileRecord, LooseRun, LooseRuns, file_records
+from vilp_data.sources.mcap_records import CHUNK_HEAD, LAST_NS, MAGIC, MESSAGE_HEAD, RECORD_HEAD, RecordReader
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary_start, summary_offset_start, summary_crc
 TAIL_SIZE = FOOTER.size + len(MAGIC)
 DATA_END = struct.Struct("<BQI")  # opcode, length, data_section_crc
 
 
-class LooseMessage(NamedTuple):
-    """A message outside all chunks: where its record's content lies."""
-
-    log_time_ns: int
-    channel_id: int
-    offset: int
-    length: int
-
-
 @dataclass
 class McapIndex:
-    """Schemas and channels by id; chunks, loose messages (by log time) and metadata by place.
+    """Schemas and channels by id; chunks and metadata by place; `loose`: the messages outside all chunks, in runs.
 
     `counts` (channel id -> messages), and the log times of the first and the last message, are None where nothing tells them.
     The data section ends at byte `data_end`; its CRC is 0 where none was written."""
@@ -42,7 +33,7 @@ class McapIndex:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
-    loose: list[LooseMessage] = field(default_factory=list)
+    loose: list[LooseRun] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
     counts: Counter[int] | None = None
@@ -51,12 +42,12 @@ class McapIndex:
     data_end: int = 0
     data_crc: int = 0
 
-    def count(self, channel_id: int, log_time_ns: int) -> None:
-        """Note one message found by scanning."""
+    def count(self, counts: Counter[int], first_ns: int, last_ns: int) -> None:
+        """Note messages found by scanning, and the log times between which they lie."""
         self.counts = Counter() if self.counts is None else self.counts
-        self.counts[channel_id] += 1
-        self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
-        self.last_ns = log_time_ns if self.last_ns is None else max(self.last_ns, log_time_ns)
+        self.counts.update(counts)
+        self.first_ns = first_ns if self.first_ns is None else min(self.first_ns, first_ns)
+        self.last_ns = last_ns if self.last_ns is None else max(self.last_ns, last_ns)
 
 
 def read_index(reader: RecordReader) -> McapIndex:
@@ -72,10 +63,13 @@ def read_index(reader: RecordReader) -> McapIndex:
     footer_start = reader.size - TAIL_SIZE
     if summary_start > footer_start:
         raise reader.damaged("the footer", f"a summary at byte {summary_start}, past the footer at {footer_start}")
-    index = _from_summary(reader, summary_start, footer_start, crc) if summary_start else None
-    if index is None:
+    summary = _summary(reader, summary_start, footer_start, crc) if summary_start else None
+    if summary is not None and _suffices(summary, reader, summary_start):
+        index = _counted(summary, reader)
+    else:
         index = _from_scan(reader)
-    times = [index.last_ns or 0, *(message.log_time_ns for message in index.loose)]
+        _refuse_other_counts(index, summary, reader)
+    times = [index.last_ns or 0, *(run.last_ns for run in index.loose)]
     if (latest := max(times)) > LAST_NS:
         raise reader.damaged("its times", f"a message at {latest} ns, past the year 2262")
     index.data_end, index.data_crc = _data_end(reader, summary_start or footer_start)
@@ -92,8 +86,8 @@ def _data_end(reader: RecordReader, after: int) -> tuple[int, int]:
 # --- from the summary -----------------------------------------------------------------------------------------------
 
 
-def _from_summary(reader: RecordReader, start: int, footer_start: int, crc: int) -> McapIndex | None:
-    """The index that the writer left, or None where it left none that suffices."""
+def _summary(reader: RecordReader, start: int, footer_start: int, crc: int) -> McapIndex:
+    """What the writer left at the end of the file."""
     section = reader.bytes_at(start, footer_start - start, "the summary")
     footer = reader.bytes_at(footer_start, FOOTER.size - 4, "the footer")  # the CRC covers all but itself
     if crc and zlib.crc32(footer, zlib.crc32(section)) != crc:
@@ -101,17 +95,26 @@ def _from_summary(reader: RecordReader, start: int, footer_start: int, crc: int)
     index = McapIndex()
     for opcode, begin, end in reader.records(section, "the summary"):
         _add(index, reader, opcode, section[begin:end], "the summary")
-    if not _describes_channels(index) or not _reaches_all(index) or not _gaps_are_read(index, reader, start):
-        return None
+    return index
+
+
+def _suffices(index: McapIndex, reader: RecordReader, data_end: int) -> bool:
+    """Whether every message can be found by a summary."""
+    return _describes_channels(index) and _reaches_all(index) and _gaps_are_read(index, reader, data_end)
+
+
+def _counted(index: McapIndex, reader: RecordReader) -> McapIndex:
+    """A summary that suffices, with its counts and its span."""
     statistics = index.statistics
     if statistics is None:
         index.counts = _counts_by_message_index(index, reader)
-        for message in index.loose:
-            index.count(message.channel_id, message.log_time_ns)
-    elif not statistics.message_count:
-        index.counts = Counter()
-    elif sum(statistics.channel_message_counts.values()) == statistics.message_count:
+        for run in index.loose:
+            index.counts += run.counts
+    elif statistics.channel_message_counts or not statistics.message_count:
         index.counts = Counter(statistics.channel_message_counts)
+        if (total := sum(index.counts.values())) != statistics.message_count:
+            found = f"{total} messages by its channels, {statistics.message_count} in all"
+            raise reader.damaged("the statistics", found)
     index.first_ns, index.last_ns = _span(index)
     return index
 
@@ -120,7 +123,7 @@ def _span(index: McapIndex) -> tuple[int | None, int | None]:
     """Log times of the first and the last message, as wide as anything in the summary tells: rosbag2's rewriter leaves statistics
     that begin after its first chunk does."""
     statistics = index.statistics
-    spans = [(message.log_time_ns, message.log_time_ns) for message in index.loose]
+    spans = [(run.first_ns, run.last_ns) for run in index.loose]
     # A chunk without messages claims a time of zero.
     spans += [
         (chunk.message_start_time, chunk.message_end_time)
@@ -153,29 +156,23 @@ def _reaches_all(index: McapIndex) -> bool:
 
 def _gaps_are_read(index: McapIndex, reader: RecordReader, data_end: int) -> bool:
     """Find the messages that lie between the indexed chunks; False where a chunk lies there that the summary does not list."""
-    position = len(MAGIC)
+    position, loose = len(MAGIC), LooseRuns()
     ends = [
         (c.chunk_start_offset, c.chunk_start_offset + c.chunk_length + c.message_index_length) for c in index.chunks
     ]
     for gap_end, after in [*sorted(ends), (data_end, data_end)]:
-        while position < gap_end:
-            opcode, length = RECORD_HEAD.unpack(reader.bytes_at(position, RECORD_HEAD.size, f"byte {position}"))
-            if opcode == Opcode.CHUNK:
+        for record in file_records(reader, position, gap_end, whole=False):
+            if record.opcode == Opcode.CHUNK:
                 return False
-            if opcode == Opcode.MESSAGE:
-                head = reader.bytes_at(position, RECORD_HEAD.size + MESSAGE_HEAD.size, f"byte {position}")
-                _note_loose(index, position, length, head)
-            position += RECORD_HEAD.size + length
+            if record.opcode == Opcode.MESSAGE:
+                loose.add(reader, record)
+            position = record.end
         if position != gap_end:
             raise reader.damaged(f"byte {position}", f"a record that runs into what begins at byte {gap_end}")
+        loose.close()
         position = after
-    index.loose.sort(key=lambda message: message.log_time_ns)
+    index.loose = loose.runs
     return True
-
-
-def _note_loose(index: McapIndex, position: int, length: int, record: bytes) -> None:
-    channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(record, RECORD_HEAD.size)
-    index.loose.append(LooseMessage(log_time, channel_id, position + RECORD_HEAD.size, length))
 
 
 def _counts_by_message_index(index: McapIndex, reader: RecordReader) -> Counter[int]:
@@ -207,57 +204,62 @@ def _add(index: McapIndex, reader: RecordReader, opcode: int, content: bytes, wh
 
 def _from_scan(reader: RecordReader) -> McapIndex:
     """Index a file by reading all of it, its data CRC checked on the way."""
-    index = McapIndex(counts=Counter())
-    crc, position = zlib.crc32(MAGIC), len(MAGIC)
-    while True:
-        head = reader.bytes_at(position, RECORD_HEAD.size, f"the record at byte {position}")
-        opcode, length = RECORD_HEAD.unpack(head)
-        if opcode == Opcode.FOOTER:
+    index, loose = McapIndex(counts=Counter()), LooseRuns()
+    crc = zlib.crc32(MAGIC)
+    for record in file_records(reader, len(MAGIC), reader.size, whole=True):
+        if record.opcode == Opcode.FOOTER:
             break
-        record = head + reader.bytes_at(position + RECORD_HEAD.size, length, f"the record at byte {position}")
-        if opcode == Opcode.DATA_END:
-            expected = struct.unpack_from("<I", record, RECORD_HEAD.size)[0] if length >= 4 else 0
+        if record.opcode == Opcode.DATA_END:
+            content = record.content()
+            expected = struct.unpack_from("<I", content)[0] if len(content) >= 4 else 0
             if expected and expected != crc:
                 raise reader.damaged("the data section", f"CRC {crc:08x} where {expected:08x} was written")
             break
-        crc = zlib.crc32(record, crc)
-        _scan_record(index, reader, opcode, position, record)
-        position += len(record)
+        if record.opcode == Opcode.MESSAGE:
+            loose.add(reader, record)
+        elif record.opcode == Opcode.CHUNK:
+            loose.close()
+            _scan_chunk(index, reader, record)
+        elif record.opcode == Opcode.METADATA:
+            length = record.end - record.position
+            index.metadata.append(MetadataIndex(offset=record.position, length=length, name=""))
+        elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            _add(index, reader, record.opcode, record.content(), f"byte {record.position}")
+        crc = zlib.crc32(memoryview(record.window)[record.begin : record.begin + record.end - record.position], crc)
+    loose.close()
+    index.loose = loose.runs
+    for run in loose.runs:
+        index.count(run.counts, run.first_ns, run.last_ns)
     _check_described(index, reader)
-    index.loose.sort(key=lambda message: message.log_time_ns)
     return index
 
 
-def _scan_record(index: McapIndex, reader: RecordReader, opcode: int, position: int, record: bytes) -> None:
-    where = f"byte {position}"
-    if opcode == Opcode.CHUNK:
-        _scan_chunk(index, reader, position, record)
-    elif opcode == Opcode.MESSAGE:
-        if len(record) < RECORD_HEAD.size + MESSAGE_HEAD.size:
-            raise reader.damaged(where, "a message record shorter than its own header")
-        _note_loose(index, position, len(record) - RECORD_HEAD.size, record)
-        index.count(index.loose[-1].channel_id, index.loose[-1].log_time_ns)
-    elif opcode == Opcode.METADATA:
-        index.metadata.append(MetadataIndex(offset=position, length=len(record), name=""))
-    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        _add(index, reader, opcode, record[RECORD_HEAD.size :], where)
-
-
-def _scan_chunk(index: McapIndex, reader: RecordReader, position: int, record: bytes) -> None:
-    where = f"the chunk at byte {position}"
-    chunk = reader.chunk_index_of(record, position)
+def _scan_chunk(index: McapIndex, reader: RecordReader, record: FileRecord) -> None:
+    where = f"the chunk at byte {record.position}"
+    chunk = reader.chunk_index_of(record.whole(), record.position)
     data = reader.chunk_data(chunk)
     times: list[int] = []
+    counts: Counter[int] = Counter()
     for opcode, begin, end in reader.records(data, where):
         if opcode == Opcode.MESSAGE and end - begin >= MESSAGE_HEAD.size:
             channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, begin)
             times.append(log_time)
-            index.count(channel_id, log_time)
+            counts[channel_id] += 1
         else:
             _add(index, reader, opcode, data[begin:end], where)
     if times and (min(times), max(times)) != (chunk.message_start_time, chunk.message_end_time):
         raise reader.damaged(where, "its messages do not lie in the time range that its header gives")
+    if times:
+        index.count(counts, min(times), max(times))
     index.chunks.append(chunk)
+
+
+def _refuse_other_counts(index: McapIndex, summary: McapIndex | None, reader: RecordReader) -> None:
+    """LogError where the writer counted other than as many messages as were found: most files without chunks have no checksum."""
+    found = sum((index.counts or {}).values())
+    if summary is not None and summary.statistics is not None and summary.statistics.message_count != found:
+        stated = summary.statistics.message_count
+        raise reader.damaged("the data section", f"{found} messages where the file's own statistics count {stated}")
 
 
 def _check_described(index: McapIndex, reader: RecordReader) -> None:
@@ -286,5 +288,5 @@ def _cut_off(reader: RecordReader) -> LogError:
         "the log is cut off: the recorder was stopped, or a copy did not finish",
         where=reader.path,
         found=f"no end mark; {intact} ({held})",
-        remedy=RECOVER,
+        remedy=copy_or_salvage(reader.path),
     )

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from vilp_data import limits
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, copy_or_salvage
 from vilp_data.sources.inflate import inflate
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -27,8 +27,6 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish ti
 
 LAST_NS = (1 << 63) - 1
 """The last time that is read, in the year 2262. MCAP has room for later ones, NumPy has not: they come from damage."""
-
-RECOVER = "copy the file again from where it was recorded; `vilp-data salvage` gets back what is intact"
 
 # What the mcap library raises for a damaged record; anything else is a mistake in the code and must surface.
 BROKEN = (McapError, struct.error, ValueError, OverflowError)
@@ -141,4 +139,6 @@ class RecordReader:
         return data
 
     def damaged(self, where: str, found: str) -> LogError:
-        return LogError(f"the log is damaged at {where}", where=self.path, found=found, remedy=RECOVER)
+        return LogError(
+            f"the log is damaged at {where}", where=self.path, found=found, remedy=copy_or_salvage(self.path)
+        )

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.store import Typestore
 
 from vilp_data import limits
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, reason
 from vilp_data.sources.inflate import LARGEST_WINDOW
 from vilp_data.sources.json_messages import read_json
 from vilp_data.sources.ros_definitions import refuse_unreasonable
@@ -86,7 +86,7 @@ def _reason(error: BaseException) -> str:
         return "types that contain themselves, or nest too deep"
     if isinstance(error, KeyError):
         return f"it refers to {error.args[0] if error.args else '?'}, which it does not define"
-    return str(error).partition("\n")[0].rstrip(":") or repr(error)
+    return reason(error)
 
 
 # --- ROS ------------------------------------------------------------------------------------------------------------
@@ -157,6 +157,12 @@ def _stock_types(distro: str, name: str) -> Typestore | None:
         if release is not None and name in (store := _stock(release)).fielddefs:
             return store
     return None
+
+
+def stock_definition(distro: str, name: str) -> str:
+    """The text of a ROS 2 type that a log of this release does not define, as `decoder_for` takes it; "" where no release has it."""
+    store = _stock_types(distro, ros_name(name))
+    return "" if store is None else str(store.generate_msgdef(ros_name(name), ros_version=2)[0])
 
 
 def _release(distro: str) -> Stores | None:

@@ -7,6 +7,8 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+MAGIC = b"#ROSBAG V2.0\n"
+COMPRESSIONS = {b"none": "", b"bz2": "bz2", b"lz4": "lz4"}
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 LARGEST_HEADER = 1 << 20  # bytes; the text of a definition lies in the data, not here
 FURTHEST_BACK = 4096  # bytes from a record's start to its `op`
@@ -15,7 +17,7 @@ NEEDED = {
     BAG_HEADER: {b"index_pos": 8, b"conn_count": 4, b"chunk_count": 4},
     INDEX: {b"conn": 4, b"count": 4},
     CHUNK: {b"size": 4},
-    CHUNK_INFO: {b"chunk_pos": 8, b"count": 4},
+    CHUNK_INFO: {b"chunk_pos": 8, b"start_time": 8, b"end_time": 8, b"count": 4},
     CONNECTION: {b"conn": 4},
 }
 OP = re.compile(rb"\x04\x00\x00\x00op=[\x02-\x07]")
@@ -41,6 +43,16 @@ class BagRecord(NamedTuple):
         return int(seconds) * 10**9 + int(nanoseconds)
 
 
+class Connection(NamedTuple):
+    """What the bag says of one publisher: `definition` is the text of its message type, empty where the recorder had none; `about`
+    is what else is said of it (`md5sum`, `callerid`, `latching`)."""
+
+    topic: str
+    type: str
+    definition: bytes
+    about: dict[str, str]
+
+
 def header_fields(header: bytes) -> dict[bytes, bytes] | None:
     """The `name=value` fields that fill a header, None where they do not."""
     fields: dict[bytes, bytes] = {}
@@ -55,6 +67,11 @@ def header_fields(header: bytes) -> dict[bytes, bytes] | None:
         fields[name] = value
         position = end
     return fields
+
+
+def bytes_of(data: bytes) -> Bytes:
+    """Those of an inflated chunk."""
+    return lambda offset, length: data[offset : offset + length]
 
 
 def bag_record(at: Bytes, position: int) -> BagRecord | None:
@@ -73,6 +90,26 @@ def bag_record(at: Bytes, position: int) -> BagRecord | None:
         return None
     begin = position + 8 + length
     return BagRecord(op, fields, position, begin, begin + int.from_bytes(header[length:], "little"))
+
+
+def connection_of(record: BagRecord, data: bytes) -> Connection | None:
+    """What a CONNECTION record with these data describes; None where that cannot be read."""
+    fields = header_fields(data)
+    if fields is None or b"type" not in fields:
+        return None
+    topic = record.fields.get(b"topic", fields.get(b"topic", b""))
+    try:
+        about = {
+            name.decode(): fields[name].decode() for name in (b"md5sum", b"callerid", b"latching") if name in fields
+        }
+        return Connection(topic.decode(), fields[b"type"].decode(), fields.get(b"message_definition", b""), about)
+    except UnicodeDecodeError:
+        return None
+
+
+def chunk_counts(data: bytes) -> dict[int, int]:
+    """Connection -> messages, as the data of a CHUNK_INFO record count them."""
+    return dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
 
 
 def starts_before(at: Bytes, op_place: int, first: int) -> Iterator[int]:

@@ -6,7 +6,9 @@ byte in an uncompressed chunk shows only where it breaks the structure.
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
+from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 
@@ -14,27 +16,51 @@ from vilp_data import limits
 from vilp_data.errors import LogError
 from vilp_data.salvage_report import SalvageReport
 from vilp_data.sources.file_bytes import FileBytes
-from vilp_data.sources.inflate import inflate_prefix
+from vilp_data.sources.inflate import Inflated, inflate_prefix, largest_guess
 from vilp_data.sources.mcap_clean import CleanMcap
 from vilp_data.sources.mcap_records import MESSAGE_HEAD
-from vilp_data.sources.rosbag1_file import COMPRESSIONS, MAGIC
 from vilp_data.sources.rosbag1_records import (
     BAG_HEADER,
     CHUNK,
     CHUNK_INFO,
+    COMPRESSIONS,
     CONNECTION,
     INDEX,
+    MAGIC,
     MESSAGE,
     OP,
     BagRecord,
     Bytes,
+    Connection,
     bag_record,
-    header_fields,
+    bytes_of,
+    chunk_counts,
+    connection_of,
     starts_before,
 )
 
 NO_SENSE = "no record makes sense here"
 PACKED = {"bz2": b"BZh", "lz4": b"\x04\x22\x4d\x18"}
+
+
+class _Chunk(NamedTuple):
+    """A chunk's place in the file, and how far its data go: up to `end`; of the one that the recorder was still writing (`is_open`) no
+    header says how far, nor what comes out."""
+
+    record: BagRecord
+    compression: str
+    size: int
+    end: int
+    is_open: bool
+    is_cut: bool
+
+
+class _Waiting(NamedTuple):
+    """Messages that nothing describes yet: where their records begin, in a chunk's data or (None) in the file."""
+
+    chunk: _Chunk | None
+    suspicious: bool
+    places: array[int]
 
 
 class Rosbag1Salvage:
@@ -45,10 +71,10 @@ class Rosbag1Salvage:
         self._clean = clean
         self._report = report
         self._drop = drop_suspicious
+        self._connections: dict[int, Connection] = {}
         self._channels: dict[int, int] = {}  # connection -> channel of the clean file
         self._schemas: dict[tuple[str, bytes], int] = {}
-        self._waiting: list[tuple[BagRecord, set[int]]] = []
-        self._only: set[int] | None = None
+        self._waiting: list[_Waiting] = []
         self._listed: Counter[int] = Counter()  # messages by connection, as the index's chunk infos count them
         self._chunk_infos = 0
         self._expected_infos: int | None = None
@@ -63,9 +89,9 @@ class Rosbag1Salvage:
             record = bag_record(self._source.at, position)
             if record is None or (after := self._take(record)) is None:
                 after = self._next_run(position)
-                self._lose(position, after)
+                self._report.lose(position, after, NO_SENSE)
             position = after
-        self._second_look()
+        self._write_waiting()
         self._conclude()
 
     # --- the walk
@@ -78,19 +104,15 @@ class Rosbag1Salvage:
         if record.end > self._source.size:
             if self._next_run(record.position) < self._source.size:
                 return None
-            self._lose(record.position, end, "a record that is cut off")
+            self._report.lose(record.position, end, "a record that is cut off")
         elif record.op == CONNECTION:
             return record.end if self._define(record, self._source.at) else None
         elif record.op == MESSAGE:
-            self._message(record, self._source.at, suspicious=False)
+            self._message(record, self._source.at, None, suspicious=False)
         elif record.op == BAG_HEADER:
             self._header(record)
         elif record.op == CHUNK_INFO:
-            counts = self._source.at(record.begin, record.end - record.begin)
-            for place in range(0, len(counts) - 7, 8):
-                self._listed[int.from_bytes(counts[place : place + 4], "little")] += int.from_bytes(
-                    counts[place + 4 : place + 8], "little"
-                )
+            self._listed.update(chunk_counts(self._source.at(record.begin, record.end - record.begin)))
             self._chunk_infos += 1
         return end
 
@@ -125,80 +147,87 @@ class Rosbag1Salvage:
     # --- connections
 
     def _define(self, record: BagRecord, at: Bytes) -> bool:
-        """Note a connection; False where it cannot be read."""
-        connection = record.number(b"conn")
-        if connection in self._channels:
+        """Note a connection; False where it cannot be read. The index repeats each; what contradicts takes its place from here on."""
+        number = record.number(b"conn")
+        if number > 0xFFFF or record.end - record.begin > limits.DEFINITION_BYTES:
+            return False
+        found = connection_of(record, at(record.begin, record.end - record.begin))
+        if found is None or not found.topic:
+            return False
+        known = self._connections.get(number)
+        if known is not None and known[:3] == found[:3]:
             return True
-        if record.end - record.begin > limits.DEFINITION_BYTES:
-            return False
-        fields = header_fields(at(record.begin, record.end - record.begin))
-        if fields is None or b"type" not in fields:
-            return False
-        try:
-            name, topic = fields[b"type"].decode(), record.fields.get(b"topic", fields.get(b"topic", b"")).decode()
-            said = {
-                key.decode(): value.decode()
-                for key, value in fields.items()
-                if key in (b"md5sum", b"callerid", b"latching")
-            }
-        except UnicodeDecodeError:
-            return False
-        if not topic or connection > 0xFFFF:
-            return False
-        definition = fields.get(b"message_definition", b"")
-        schema_id = self._schemas.setdefault((name, definition), len(self._schemas) + 1)
-        schema = Schema(id=schema_id, name=name, encoding="ros1msg", data=definition)
-        channel = Channel(id=connection, topic=topic, message_encoding="ros1", metadata=said, schema_id=schema_id)
-        self._channels[connection] = self._clean.describe(channel, schema)
+        if known is not None:
+            said = f"as {known.topic} ({known.type}) and as {found.topic} ({found.type})"
+            self._report.doubt(
+                f"connection {number} is described twice, {said}: its messages are taken for what was said last before them"
+            )
+        schema_id = self._schemas.setdefault((found.type, found.definition), len(self._schemas) + 1)
+        schema = Schema(id=schema_id, name=found.type, encoding="ros1msg", data=found.definition)
+        channel = Channel(
+            id=number, topic=found.topic, message_encoding="ros1", metadata=found.about, schema_id=schema_id
+        )
+        self._connections[number] = found
+        self._channels[number] = self._clean.describe(channel, schema)
         return True
 
     # --- messages
 
     def _chunk(self, record: BagRecord) -> int | None:
+        """Take a chunk's messages; where it ends, None where it is none."""
+        chunk = self._chunk_of(record)
+        if chunk is None:
+            return None
+        if max(chunk.size, chunk.end - record.begin) > limits.CHUNK_BYTES:
+            self._report.lose(
+                record.position, record.end, f"a chunk of {chunk.size:,} bytes, above VILP_MAX_CHUNK_BYTES"
+            )
+            return record.end
+        data, fault = self._inflated(chunk)
+        complete = self._records_in(chunk, data, suspicious=bool(fault) and not chunk.is_cut)
+        if fault or not complete:
+            self._report.amount_known = False
+            what = "a chunk that is cut off" if chunk.is_cut else "a damaged chunk"
+            came_out = f"{len(data):,}{'' if chunk.is_open else f' of {chunk.size:,}'} bytes inflate"
+            why = f"; {fault}" if fault and not chunk.is_cut else ""
+            self._report.doubt(f"byte {record.position:,}: {what}: {came_out}{why}")
+        return chunk.end
+
+    def _chunk_of(self, record: BagRecord) -> _Chunk | None:
+        """How far a chunk's data go; None where it is packed in no known way."""
         compression = COMPRESSIONS.get(record.fields.get(b"compression", b""))
         if compression is None:
             return None
-        size, begin, end = record.number(b"size"), record.begin, record.end
-        if begin == end and self._source.at(begin, 4).startswith(PACKED.get(compression, b"\0")):
-            end, size = self._source.size, limits.CHUNK_BYTES  # the recorder writes sizes when the chunk is done
+        if record.begin == record.end and self._source.at(record.begin, 4).startswith(PACKED.get(compression, b"\0")):
+            # The recorder writes sizes when the chunk is done.
             self._report.note("the last chunk was still being written")
-        cut = end > self._source.size or size == limits.CHUNK_BYTES
-        if max(size, min(end, self._source.size) - begin) > limits.CHUNK_BYTES:
-            self._lose(record.position, end, f"a chunk of {size:,} bytes, above VILP_MAX_CHUNK_BYTES")
-            return end
-        end = min(end, self._source.size)
-        data, fault = inflate_prefix(self._source.at(begin, end - begin), compression, size)
-        complete = self._records_in(record, data, cut=cut, suspicious=bool(fault) and not cut)
-        if (fault or not complete) and self._only is None:
-            self._report.amount_known = False
-            what = "a chunk that is cut off" if cut else "a damaged chunk"
-            self._report.doubt(
-                f"byte {record.position:,}: {what}: {len(data):,} of {size:,} bytes inflate"
-                + (f"; {fault}" if fault and not cut else "")
-            )
-        return end
+            size = largest_guess(self._source.size - record.begin)
+            return _Chunk(record, compression, size, self._source.size, is_open=True, is_cut=True)
+        end, is_cut = min(record.end, self._source.size), record.end > self._source.size
+        return _Chunk(record, compression, record.number(b"size"), end, is_open=False, is_cut=is_cut)
 
-    def _records_in(self, chunk: BagRecord, data: bytes, *, cut: bool, suspicious: bool) -> bool:
+    def _inflated(self, chunk: _Chunk) -> Inflated:
+        packed = self._source.at(chunk.record.begin, chunk.end - chunk.record.begin)
+        return inflate_prefix(packed, chunk.compression, chunk.size)
+
+    def _records_in(self, chunk: _Chunk, data: bytes, *, suspicious: bool) -> bool:
         """Take the records of an inflated chunk; whether they follow each other to its end."""
-
-        def at(offset: int, length: int) -> bytes:
-            return data[offset : offset + length]
-
-        places = sorted(self._index_behind(chunk)) if not cut else []
+        at = bytes_of(data)
+        places = [] if chunk.is_cut else sorted(self._index_behind(chunk.record))
         position, complete = 0, True
         while position < len(data):
             record = bag_record(at, position)
             sensible = record is not None and record.op in (MESSAGE, CONNECTION) and record.end <= len(data)
             if record is not None and sensible and (record.op == MESSAGE or self._define(record, at)):
                 if record.op == MESSAGE:
-                    self._message(record, at, suspicious=suspicious, chunk=chunk)
+                    self._message(record, at, chunk, suspicious=suspicious)
                 position = record.end
                 continue
             complete = False
             following = next((place for place in places if place > position), None)
             if following is None and not places:
                 following = _next_message(data, at, position + 1)
-            if following is None or cut:
+            if following is None or chunk.is_cut:
                 break
             position = following
         return complete
@@ -213,17 +242,18 @@ class Rosbag1Salvage:
             record = bag_record(self._source.at, record.end)
         return places
 
-    def _message(self, record: BagRecord, at: Bytes, *, suspicious: bool, chunk: BagRecord | None = None) -> None:
+    def _message(self, record: BagRecord, at: Bytes, chunk: _Chunk | None, *, suspicious: bool) -> None:
+        """Write a message, or keep its place until something describes its connection."""
         connection = record.number(b"conn")
-        if self._only is not None and connection not in self._only:
-            return
         if connection not in self._channels:
-            if not self._waiting or self._waiting[-1][0] is not (chunk or record):
-                self._waiting.append((chunk or record, set()))
-            self._waiting[-1][1].add(connection)
+            last = self._waiting[-1] if self._waiting else None
+            if last is None or last.chunk is not chunk:
+                last = _Waiting(chunk, suspicious, array("q"))
+                self._waiting.append(last)
+            last.places.append(record.position)
             return
         if record.end - record.begin > limits.RECORD_BYTES:
-            self._lose(record.position, record.end, "a message above VILP_MAX_RECORD_BYTES")
+            self._report.lose(record.position, record.end, "a message above VILP_MAX_RECORD_BYTES")
             return
         if suspicious and self._drop:
             self._report.suspicious_left_out += 1
@@ -237,28 +267,21 @@ class Rosbag1Salvage:
         data = at(record.begin, record.end - record.begin)
         self._clean.message(channel_id, MESSAGE_HEAD.pack(channel_id, 0, time_ns, time_ns) + data)
 
-    def _second_look(self) -> None:
-        """Messages whose connection was described only further on, as in the index."""
+    def _write_waiting(self) -> None:
+        """Write the messages whose connection was described only further on, as in the index."""
         waiting, self._waiting = self._waiting, []
-        doubts, notes, skipped = list(self._report.doubts), list(self._report.notes), list(self._report.skipped)
-        for record, connections in waiting:
-            self._only = connections
-            self._chunk(record) if record.op == CHUNK else self._message(record, self._source.at, suspicious=False)
-        self._only = None
-        self._report.doubts[:], self._report.notes[:], self._report.skipped[:] = doubts, notes, skipped
-        if lost := sorted({connection for _, connections in self._waiting for connection in connections}):
+        for chunk, suspicious, places in waiting:
+            at = self._source.at if chunk is None else bytes_of(self._inflated(chunk).data)
+            for place in places:
+                record = bag_record(at, place)
+                if record is not None:
+                    self._message(record, at, chunk, suspicious=suspicious)
+        if self._waiting:
+            count = sum(len(still.places) for still in self._waiting)
             self._report.amount_known = False
-            numbers = ", ".join(map(str, lost))
-            self._report.doubt(
-                f"messages of connection {numbers} are left out: the record that says what they are is lost"
-            )
+            self._report.doubt(f"{count:,} messages are left out: the records that say what they are are lost")
 
     # --- sums
-
-    def _lose(self, begin: int, end: int, what: str = NO_SENSE) -> None:
-        self._report.skip(begin, end, what)
-        self._report.amount_known = False
-        self._report.doubt("bytes are missing or unreadable")
 
     def _conclude(self) -> None:
         report = self._report

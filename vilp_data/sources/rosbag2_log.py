@@ -15,16 +15,17 @@ from typing import NamedTuple, Self
 import numpy as np
 import zstandard
 
-from vilp_data.errors import LogError, nearest
+from vilp_data.errors import LogError, copy_or_salvage, nearest
 from vilp_data.sources.channels import WHOLE_FILE, RawMessage
 from vilp_data.sources.db3_log import MAGIC as SQLITE_MAGIC
 from vilp_data.sources.db3_log import Db3Log
+from vilp_data.sources.file_bytes import first_bytes
 from vilp_data.sources.folder_hash import file_sha256, folder_sha256
 from vilp_data.sources.inflate import LARGEST_WINDOW
 from vilp_data.sources.mcap_log import McapLog
 from vilp_data.sources.mcap_records import MAGIC as MCAP_MAGIC
 from vilp_data.sources.message_decoders import ZSTD_MAGIC
-from vilp_data.sources.rosbag2_metadata import COMPRESSED_SUFFIX, read_metadata
+from vilp_data.sources.rosbag2_metadata import COMPRESSED_SUFFIX, missing_from_file, missing_messages, read_metadata
 from vilp_data.types import EPISODE_RECORD, I64, LogEpisode, Message, TopicInfo
 
 LISTED_TIMES = 1_000_000  # log times read by message_times, over all files
@@ -32,9 +33,6 @@ FREE_RATIO_BYTES = 1 << 30
 LARGEST_RATIO = 2000
 """How much larger a file may become when inflated, beyond its first gigabyte: what zstd makes of a black camera, and more than of any
 recording. It bounds what a small file can put on the disk."""
-SALVAGE = (
-    "copy it again from where it was recorded; `zstd -d` inflates what is there, and `vilp-data salvage` takes that"
-)
 
 PartLog = McapLog | Db3Log
 
@@ -78,8 +76,8 @@ class Rosbag2Log:
         if self._metadata is not None:
             if self._metadata.custom:
                 records[EPISODE_RECORD] = records.get(EPISODE_RECORD, {}) | self._metadata.custom
-            told = {"release": self._metadata.release, "compression": self._metadata.compression}
-            records["bag"] = {"files": str(len(self._parts))} | {name: value for name, value in told.items() if value}
+            stated = {"release": self._metadata.release, "compression": self._metadata.compression}
+            records["bag"] = {"files": str(len(self._parts))} | {name: value for name, value in stated.items() if value}
         return records
 
     def episodes(self) -> list[LogEpisode]:
@@ -90,18 +88,25 @@ class Rosbag2Log:
         tags = self.metadata().get(EPISODE_RECORD, {})
         return [LogEpisode(WHOLE_FILE, min(first for first, _ in spans), max(end for _, end in spans), tags)]
 
+    def doubts(self) -> list[str]:
+        """Where the files hold other than as many messages as metadata.yaml counts."""
+        if self._metadata is None:
+            return missing_from_file(self.path, self._parts[0].count)
+        return missing_messages(self._metadata, {part.path: part.count for part in self._parts})
+
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """As `LogReader.messages`. After a MessageError the iterator can be asked for the next message.
 
         An unreadable topic is refused before the first message where the first file with that topic tells so."""
-        known = {name for part in self._parts for name in part.topics}
-        for topic in topics:
-            if topic not in known:
-                raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, known))
-        self._require_decoders(set(topics))
-        return map(_decoded, self._joined(set(topics), start_ns, end_ns))
+        return map(_decoded, self._serialised(set(topics), start_ns, end_ns))
+
+    def raw_messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """The messages that `messages` gives, still serialised; channels are numbered in each file by itself."""
+        return (message.raw for message in self._serialised(set(topics), start_ns, end_ns))
 
     def message_times(self) -> tuple[dict[str, I64], bool]:
         """Topic -> log times [n], file after file; and whether they are all (else the first part)."""
@@ -135,6 +140,13 @@ class Rosbag2Log:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def _serialised(self, topics: set[str], start_ns: int | None, end_ns: int | None) -> Iterator[_Serialised]:
+        known = {name for part in self._parts for name in part.topics}
+        for topic in sorted(topics - known):
+            raise LogError(f"no topic {topic!r} in this log", where=self.path, remedy=nearest(topic, known))
+        self._require_decoders(topics)
+        return self._joined(topics, start_ns, end_ns)
 
     def _require_decoders(self, topics: set[str]) -> None:
         for part in self._parts:
@@ -185,15 +197,17 @@ def _push(
 
 
 class _Part:
-    """One file of a bag: its topics by name, and its span [first log time, last + 1), None where it holds no message. Kept open by
-    `stack`, else only while it is read."""
+    """One file of a bag: its topics by name, its span [first log time, last + 1), None where it holds no message, and how many it holds,
+    None where nothing tells. Kept open by `stack`, else only while it is read."""
 
     def __init__(self, path: Path, stack: ExitStack | None) -> None:
-        self._path = path
+        self.path = path
         self._kept = stack.enter_context(_open_part(path)) if stack is not None else None
         with self.opened() as log:
             self.topics = {topic.name: topic for topic in log.topics()}
             episodes = log.episodes()
+        counts = [topic.message_count for topic in self.topics.values()]
+        self.count = None if None in counts else sum(count or 0 for count in counts)
         self.span = (episodes[0].start_ns, episodes[0].end_ns) if episodes else None
 
     @contextmanager
@@ -201,7 +215,7 @@ class _Part:
         if self._kept is not None:
             yield self._kept
         else:
-            with _open_part(self._path) as log:
+            with _open_part(self.path) as log:
                 yield log
 
     def serialised(self, topics: set[str], start_ns: int | None, end_ns: int | None) -> Iterator[_Serialised]:
@@ -215,26 +229,20 @@ def _open_part(path: Path) -> Iterator[PartLog]:
     """The reader of one file of a bag, inflated before where it is compressed."""
     with ExitStack() as stack:
         file = path
-        if _head(path).startswith(ZSTD_MAGIC):
+        if first_bytes(path).startswith(ZSTD_MAGIC):
             folder = stack.enter_context(TemporaryDirectory(prefix="vilp-bag-"))
             file = Path(folder) / path.name.removesuffix(COMPRESSED_SUFFIX)
             _inflate_file(path, file)
-        head = _head(file)
+        head = first_bytes(file)
         if head.startswith(MCAP_MAGIC):
             yield stack.enter_context(McapLog(file, named=path))
         elif head.startswith(SQLITE_MAGIC):
             yield stack.enter_context(Db3Log(file, named=path))
         else:
             found = f"it begins with {head!r}" if head else "0 bytes"
-            raise LogError("a file of the bag is neither MCAP nor SQLite", where=path, found=found, remedy=SALVAGE)
-
-
-def _head(path: Path) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            return stream.read(len(SQLITE_MAGIC))
-    except OSError as error:
-        raise LogError("cannot be opened", where=path, found=error.strerror, remedy="check its permissions") from error
+            raise LogError(
+                "a file of the bag is neither MCAP nor SQLite", where=path, found=found, remedy=copy_or_salvage(path)
+            )
 
 
 def _inflate_file(packed: Path, plain: Path) -> None:
@@ -256,7 +264,9 @@ def _inflate_file(packed: Path, plain: Path) -> None:
                     )
                 target.write(block)
     except zstandard.ZstdError as error:
-        raise LogError("the compressed file is damaged", where=packed, found=str(error), remedy=SALVAGE) from error
+        raise LogError(
+            "the compressed file is damaged", where=packed, found=str(error), remedy=copy_or_salvage(packed)
+        ) from error
     except OSError as error:
         remedy = "a compressed bag needs room in the temporary folder: set TMPDIR to one on a larger disk"
         raise LogError("cannot be inflated", where=packed, found=error.strerror, remedy=remedy) from error

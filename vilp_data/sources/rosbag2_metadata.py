@@ -1,7 +1,9 @@
-"""metadata.yaml, which makes a folder of files one ROS 2 bag."""
+"""metadata.yaml, which makes a folder of files one ROS 2 bag, and counts the messages in them."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, reason
 
 FILE_NAME = "metadata.yaml"
 KEY = "rosbag2_bagfile_information"
@@ -21,10 +23,13 @@ REINDEX = "`ros2 bag reindex FOLDER`, where ROS 2 is installed, writes it anew; 
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """`files` in the order of recording; `custom` is what the recorder was told to note (`--custom-data`); `release` of ROS 2 and
+    """`files` in the order of recording, each once; `counts`: messages by the name of a file, `total`: in all, as far as they are stated;
+    `custom` is what the recorder was told to note (`--custom-data`); `release` of ROS 2 and
     `compression` ("zstd, file") are empty where nothing tells."""
 
     files: tuple[Path, ...]
+    counts: Mapping[str, int]
+    total: int | None
     custom: dict[str, str]
     release: str
     compression: str
@@ -47,7 +52,7 @@ def lone_file(folder: Path) -> Path | None:
 
 
 def read_metadata(folder: Path) -> BagMetadata:
-    """LogError where metadata.yaml cannot be understood, or a file that it lists is not there."""
+    """LogError where metadata.yaml cannot be understood, or a file that it lists is not there, or is listed twice."""
     table = _table(folder / FILE_NAME)
     names = table.get("relative_file_paths")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
@@ -61,15 +66,61 @@ def read_metadata(folder: Path) -> BagMetadata:
             found=", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else ""),
             remedy=f"put them back beside metadata.yaml; {REINDEX}",
         )
+    twice = [name for file, n in Counter(files).items() if n > 1 for name in names if _file(folder, name) == file]
+    if twice:
+        found = ", ".join(twice[:5])
+        raise LogError("metadata.yaml lists a file of the bag twice", where=folder, found=found, remedy=REINDEX)
     custom = table.get("custom_data")
     return BagMetadata(
-        files=tuple(dict.fromkeys(file for file in files if file is not None)),
+        files=tuple(file for file in files if file is not None),
+        counts=_counts(table),
+        total=_count(table),
         custom={str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {},
         release=_word(table, "ros_distro"),
         compression=", ".join(
             filter(None, (_word(table, "compression_format"), _word(table, "compression_mode").lower()))
         ),
     )
+
+
+def missing_messages(metadata: BagMetadata, found: Mapping[Path, int | None]) -> list[str]:
+    """A sentence on each file of a bag in which there are other than as many messages as metadata.yaml counts; `found` are those of each
+    file, None where nothing tells."""
+    sentences = []
+    for file, count in found.items():
+        stated = metadata.counts.get(file.name.removesuffix(COMPRESSED_SUFFIX))
+        if len(metadata.files) == 1 and stated is None:
+            stated = metadata.total
+        if None not in (stated, count) and stated != count:
+            sentences.append(f"{FILE_NAME} counts {stated:,} messages in {file.name}, where {count:,} are")
+    counts = [count for count in found.values() if count is not None]
+    if not sentences and len(metadata.files) == len(counts) and metadata.total not in (None, sum(counts)):
+        sentences.append(f"{FILE_NAME} counts {metadata.total:,} messages in all, where {sum(counts):,} are")
+    return sentences
+
+
+def missing_from_file(file: Path, count: int | None) -> list[str]:
+    """The same of one file, where it lies in a bag's folder and is a part of that bag."""
+    try:
+        metadata = read_metadata(file.parent) if is_bag_folder(file.parent) else None
+    except LogError:
+        return []
+    return missing_messages(metadata, {file: count}) if metadata is not None and file in metadata.files else []
+
+
+def _counts(table: dict[str, Any]) -> dict[str, int]:
+    """Messages by the name of a file, by which of the two names it may have on disk the one that is not compressed."""
+    entries = table.get("files")
+    found = {}
+    for entry in entries if isinstance(entries, list) else ():
+        if isinstance(entry, dict) and isinstance(entry.get("path"), str) and (count := _count(entry)) is not None:
+            found[PurePosixPath(entry["path"].replace("\\", "/")).name.removesuffix(COMPRESSED_SUFFIX)] = count
+    return found
+
+
+def _count(table: dict[str, Any]) -> int | None:
+    count = table.get("message_count")
+    return count if isinstance(count, int) and not isinstance(count, bool) else None
 
 
 def _table(path: Path) -> dict[str, Any]:
@@ -82,7 +133,7 @@ def _table(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise LogError("cannot be opened", where=path, found=error.strerror, remedy="check its permissions") from error
     except (YAMLError, ValueError, RecursionError, TypeError, KeyError, AttributeError, IndexError) as error:
-        raise _unusable(path.parent, (str(error) or repr(error)).partition("\n")[0]) from error
+        raise _unusable(path.parent, reason(error)) from error
     table = content.get(KEY) if isinstance(content, dict) else None
     if not isinstance(table, dict):
         raise _unusable(path.parent, f"no table {KEY}")

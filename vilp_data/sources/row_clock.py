@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import PurePath
 
 import numpy as np
 
 from vilp_data.errors import UsageError
 from vilp_data.types import I64
+
+SLOWEST_HZ, FASTEST_HZ = 1e-6, 100_000.0
+"""A row in twelve days, and one in 10 us. Outside of that, times would all be one or leave 64 bits."""
+
+
+def is_rate(rate_hz: float) -> bool:
+    """Whether rows can be as fast as that; no for NaN."""
+    return SLOWEST_HZ <= rate_hz <= FASTEST_HZ
 
 
 @dataclass(frozen=True)
@@ -20,9 +27,11 @@ class RowClock:
 
     @classmethod
     def at(cls, rate_hz: float, where: PurePath) -> RowClock:
-        """The clock of a rate that a caller asks for. UsageError where it is not a positive number."""
-        if not (rate_hz > 0 and isfinite(rate_hz)):
-            raise UsageError(f"array_rate_hz must be positive, not {rate_hz}", where=where)
+        """The clock of a rate that a caller asks for. UsageError where rows cannot be as fast."""
+        if not is_rate(rate_hz):
+            raise UsageError(
+                f"array_rate_hz must lie between {SLOWEST_HZ:g} and {FASTEST_HZ:g}, not at {rate_hz}", where=where
+            )
         return cls(rate_hz)
 
     def time_ns(self, row: int) -> int:

@@ -18,13 +18,13 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from vilp_data import limits
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, copy_again, reason
 from vilp_data.types import U8
 
 TOLERANCE_NS = 2_000_000
 """How far a frame's time may lie from its row's: rounding of time stamps stays far below, a quarter of a frame at 120 Hz is above."""
 
-RECOPY = "copy the video again from its source, or leave this episode out"
+RECOPY = copy_again("video", leave="this episode")
 BROKEN = (av.FFmpegError, ValueError, RuntimeError, OSError, EOFError, IndexError)
 _THREADS = 1  # ingest has a process on every core
 
@@ -94,7 +94,7 @@ def _decoded(
     except LogError:
         raise
     except BROKEN as error:
-        raise LogError("the video cannot be decoded", where=where, found=_words(error), remedy=RECOPY) from error
+        raise LogError("the video cannot be decoded", where=where, found=reason(error), remedy=RECOPY) from error
 
 
 def video_sha256(path: Path, start_ns: int, end_ns: int, *, where: str) -> str:
@@ -118,7 +118,7 @@ def video_sha256(path: Path, start_ns: int, end_ns: int, *, where: str) -> str:
                 elif packet.dts is not None and round(packet.dts * base * 10**9) >= end_ns:
                     break
         except BROKEN as error:
-            raise LogError("the video cannot be read", where=where, found=_words(error), remedy=RECOPY) from error
+            raise LogError("the video cannot be read", where=where, found=reason(error), remedy=RECOPY) from error
     return digest.hexdigest()
 
 
@@ -130,7 +130,7 @@ def _opened(path: Path, where: str) -> Any:
         # Local files only, and none that a playlist in the file could name.
         return av.open(str(path), options={"protocol_whitelist": "file"})
     except BROKEN as error:
-        raise LogError("the video cannot be opened", where=where, found=_words(error), remedy=RECOPY) from error
+        raise LogError("the video cannot be opened", where=where, found=reason(error), remedy=RECOPY) from error
 
 
 def _video_stream(container: Any, where: str) -> Any:
@@ -152,7 +152,7 @@ def _rgb(frame: av.VideoFrame, reformatter: VideoReformatter, where: str) -> U8:
         picture = reformatter.reformat(frame, format="rgb24", interpolation="BILINEAR", threads=_THREADS)
         return np.asarray(picture.to_ndarray(), np.uint8)
     except BROKEN as error:
-        raise LogError("a frame of the video is no picture", where=where, found=_words(error), remedy=RECOPY) from error
+        raise LogError("a frame of the video is no picture", where=where, found=reason(error), remedy=RECOPY) from error
 
 
 def _no_frame(where: str, times_ns: Sequence[int], row: int, before_ns: int | None, after_ns: int) -> LogError:
@@ -163,7 +163,3 @@ def _no_frame(where: str, times_ns: Sequence[int], row: int, before_ns: int | No
         found=f"row {row} is at {times_ns[row] / 1e9:.4f} s; the nearest frames: {before}, {after_ns / 1e9:.4f} s",
         remedy="frames were lost, or the video runs at another rate or start than its table: encode it again from its images",
     )
-
-
-def _words(error: BaseException) -> str:
-    return str(error) or repr(error)

@@ -7,6 +7,7 @@ a missing chunk is refused (zarr would hand out its fill value), a damaged one o
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -15,14 +16,16 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 import zarr
-from zarr.errors import BaseZarrError
+from zarr.errors import BaseZarrError, ZarrUserWarning
 
-from vilp_data.errors import LogError, nearest
-from vilp_data.sources.folder_hash import folder_sha256
+from vilp_data import limits
+from vilp_data.errors import LogError, copy_again, nearest, reason
+from vilp_data.sources.folder_hash import array_bytes, folder_sha256
 from vilp_data.sources.row_clock import RowClock
+from vilp_data.sources.zarr_chunks import chunk_files, inflated_bytes
 from vilp_data.types import I64, LogEpisode, Message, TopicInfo
 
-RECOPY = "copy the folder again from its source"
+RECOPY = copy_again("folder")
 LAYOUT = "expected the diffusion-policy layout: arrays under data/ and row counts in meta/episode_ends"
 
 # What zarr and its codecs raise for damaged metadata or chunks.
@@ -37,6 +40,10 @@ BROKEN = (
     MemoryError,
     OverflowError,
 )
+
+
+def is_zarr(path: Path) -> bool:
+    return (path / ".zgroup").is_file() or (path / "zarr.json").is_file()
 
 
 class ZarrLog:
@@ -73,7 +80,7 @@ class ZarrLog:
                 except LogError:
                     digest.update(b"unreadable")
                 else:
-                    digest.update(_bytes_of(rows))
+                    digest.update(array_bytes(rows))
         return digest.hexdigest()
 
     def topics(self) -> list[TopicInfo]:
@@ -90,6 +97,23 @@ class ZarrLog:
         return [
             LogEpisode(name, self._clock.time_ns(start), self._clock.time_ns(end))
             for name, (start, end) in self._row_ranges().items()
+        ]
+
+    def doubts(self) -> list[str]:
+        """Where arrays have rows behind the last episode's end (of an episode whose writer crashed, or whose end is cut off the list), and
+        where a folder in data/ holds none: zarr passes over one whose metadata it cannot read."""
+        behind = {name: int(array.shape[0]) - self.n_rows for name, array in self._arrays.items()}
+        folders = {entry.name for entry in (self.path / "data").iterdir() if entry.is_dir()}
+        return [
+            *(
+                f"data/{name} is read as no array: its metadata is missing or damaged, or it holds others"
+                for name in sorted(folders - behind.keys())
+            ),
+            *(
+                f"data/{name} has {rows:,} rows in no demonstration, behind the last end in meta/episode_ends, {self.n_rows:,}"
+                for name, rows in sorted(behind.items())
+                if rows > 0
+            ),
         ]
 
     def _row_ranges(self) -> dict[str, tuple[int, int]]:
@@ -137,50 +161,42 @@ class ZarrLog:
         if cached is not None and cached[0] == number:
             return cached[1]
         array = self._arrays[topic]
-        self._refuse_missing(topic, number)
+        rows_bytes = array.chunks[0] * int(np.prod(array.shape[1:], dtype=object)) * array.dtype.itemsize
+        limits.check(f"chunk {number} of data/{topic}", "ARRAY_CHUNK_BYTES", rows_bytes, where=self.path)
         try:
+            self._refuse_missing(topic, number)
             rows = np.asarray(array[number * array.chunks[0] : (number + 1) * array.chunks[0]])
         except BROKEN as error:
             where = f"chunk {number} of data/{topic}"
-            raise LogError(
-                f"{where} cannot be read", where=self.path, found=str(error) or repr(error), remedy=RECOPY
-            ) from error
+            raise LogError(f"{where} cannot be read", where=self.path, found=reason(error), remedy=RECOPY) from error
         rows.flags.writeable = False
         self._cached[topic] = number, rows
         return rows
 
     def _refuse_missing(self, topic: str, number: int) -> None:
-        metadata = self._arrays[topic].metadata
-        counts = [
-            -(-size // chunk) for size, chunk in zip(self._arrays[topic].shape, self._arrays[topic].chunks, strict=True)
-        ]
-        for rest in np.ndindex(*counts[1:]):
-            key = metadata.encode_chunk_key((number, *rest))
-            if not (self.path / "data" / topic / key).is_file():
+        """LogError where a file that the rows need is not there, or inflates to more than any array's chunk."""
+        for key in chunk_files(self._arrays[topic], number):
+            file = self.path / "data" / topic / key
+            if not file.is_file():
                 raise LogError(
                     f"data/{topic} lacks its chunk {key}",
                     where=self.path,
                     found="no such file; zarr would read it as its fill value",
                     remedy=f"{RECOPY}; if those rows really are empty, write the store with write_empty_chunks=True",
                 )
-
-
-def _bytes_of(rows: npt.NDArray[Any]) -> bytes | memoryview:
-    """What an array holds, to be hashed; without a copy where its rows lie together."""
-    if rows.dtype.hasobject:
-        return repr(rows.tolist()).encode()
-    return np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
+            size = inflated_bytes(self._arrays[topic], file)
+            limits.check(f"data/{topic}, chunk {key},", "ARRAY_CHUNK_BYTES", size, where=self.path)
 
 
 def _open_store(path: Path) -> tuple[dict[str, Any], I64]:
     try:
         root = zarr.open_group(path, mode="r")
-        arrays = dict(root["data"].arrays()) if "data" in root else {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ZarrUserWarning)  # of arrays that are passed over: `doubts` names them
+            arrays = dict(root["data"].arrays()) if "data" in root else {}
         ends = np.asarray(root["meta/episode_ends"][:]) if "meta/episode_ends" in root else None
     except BROKEN as error:
-        raise LogError(
-            "the zarr store cannot be opened", where=path, found=str(error) or repr(error), remedy=RECOPY
-        ) from error
+        raise LogError("the zarr store cannot be opened", where=path, found=reason(error), remedy=RECOPY) from error
     if not arrays or ends is None:
         missing = "data/ holds no array" if not arrays else "there is no meta/episode_ends"
         raise LogError("not a zarr store of demonstrations", where=path, found=missing, remedy=LAYOUT)

@@ -9,11 +9,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from vilp_data import shards
+from vilp_data import history, journal, shards
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import StoreError, UsageError, VilpDataError
 from vilp_data.staleness import run_encoder
-from vilp_data.surgery import history, journal
+from vilp_data.writer_lock import leftovers, writer_lock
 
 KEEP = 20
 """Operations whose undo is kept, unless told otherwise."""
@@ -48,27 +48,28 @@ def collect_garbage(root: Path, *, keep: int = KEEP, runs: Sequence[Path] = (), 
     """Delete what nothing refers to: files held for the undo of operations older than the last `keep`, latents whose encoder is in no
     run (of DATASET/runs or of `runs`), or whose episode is neither stored nor held, frames without an episode, temporary files.
 
-    Where no run there can be read as an encoder, no latents are judged by their key. Raises UsageError for a `keep` below 0."""
+    Where no run there can be read as an encoder, no latents are judged by their key. Raises UsageError for a `keep` below 0, and for one
+    of `runs` that is no encoder's run."""
     if keep < 0:
         raise UsageError("a number of operations to keep is not negative", found=keep, remedy="0 keeps no undo at all")
     if not (root / "dataset.json").is_file():
         EpisodeStore(root).spec()  # says that it is none
-    with shards.writer_lock(root):
+    with writer_lock(root):
         store, report = EpisodeStore(root), GarbageReport()
+        _refuse_unread_runs(root, runs)
         last = max(history.numbers(root), default=0)
         floor = max(last - keep, 0)  # operations up to here can no longer be taken back
         report.found += _held_too_long(root, floor)
         report.found += _lost_frames(root, store)
         report.found += _latents(root, store, floor, runs, report.notes)
-        report.found += _temporary(root)
+        report.found += [_garbage(path, "a temporary file") for path in leftovers(root)]
         if not dry_run:
             _delete(root, report)
             _forget_states(root, floor)
             report.deleted = True
             if report.found:
-                history.record(
-                    root, "gc", f"{len(report.found)} files deleted, {size_text(report.size)}; undo back to {floor + 1}"
-                )
+                note = f"{len(report.found)} files deleted, {size_text(report.size)}; undo back to {floor + 1}"
+                history.begin(root).record("gc", note)
     return report
 
 
@@ -139,6 +140,25 @@ def _source_frames(path: Path) -> str:
     return "damaged"
 
 
+def _refuse_unread_runs(root: Path, runs: Sequence[Path]) -> None:
+    """UsageError for a run, named by its user, that holds no encoder for any view with latents."""
+    views = sorted(path.name for path in (root / "latents").glob("[!.]*/"))
+    for run in runs:
+        found = [] if run.is_dir() else ["no such folder"]
+        for view in views if run.is_dir() else ():
+            try:
+                if run_encoder(run, view) is not None:
+                    break
+            except VilpDataError as error:
+                found.append(error.what)
+        else:
+            if found or views:
+                remedy = "name the folder of a trained frame encoder, such as DATASET/runs/vqgan"
+                raise UsageError(
+                    "not the run of a frame encoder", where=run, found=found[0] if found else None, remedy=remedy
+                )
+
+
 def _key_fields(root: Path, runs: Sequence[Path], view: str) -> tuple[list[dict[str, str]], str]:
     """What the keys of the view's encoders are made of, one for each run; and which runs could not be read, in words."""
     found, unread = [], []
@@ -163,13 +183,6 @@ def _is_of(folder: Path, encoders: list[dict[str, str]]) -> bool:
 
 def _without_device(fields: dict[str, str]) -> dict[str, str]:
     return {name: value for name, value in fields.items() if name not in _BY_DEVICE}
-
-
-def _temporary(root: Path) -> Iterator[Garbage]:
-    """Hidden temporary files of a writer that died; those of recorders and trainers, in logs/ and runs/, are theirs."""
-    for folder in ("episodes", "latents", "action_sets", "history", "generated"):
-        for path in sorted((root / folder).rglob(".*.tmp")):
-            yield _garbage(path, "a temporary file")
 
 
 def _garbage(path: Path, why: str) -> Garbage:

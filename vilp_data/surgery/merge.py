@@ -12,16 +12,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from vilp_data import shards
+from vilp_data import history, journal, shards
+from vilp_data.dataset_state import frames_name, steps_name
+from vilp_data.episode_entry import free_id
 from vilp_data.episodes import EpisodeEntry, EpisodeStore, write_steps
 from vilp_data.errors import StoreError, UsageError
-from vilp_data.ingest import RATE_TOLERANCE
+from vilp_data.history import Changes
 from vilp_data.keys import first_difference
 from vilp_data.latents import latents_path
-from vilp_data.surgery import history, journal
-from vilp_data.surgery.dataset_state import frames_name, steps_name
-from vilp_data.surgery.history import Changes
-from vilp_data.surgery.removed import read_removed
+from vilp_data.removed import read_removed
+from vilp_data.types import RATE_TOLERANCE
+from vilp_data.writer_lock import writer_lock
 
 
 @dataclass
@@ -50,21 +51,20 @@ def merge_datasets(other: Path, into: Path) -> MergeReport:
     if other.resolve() == into.resolve():
         raise UsageError("a dataset cannot be merged into itself", where=into, remedy="name two datasets")
     there, here = EpisodeStore(other), EpisodeStore(into)
-    with shards.writer_lock(into), _held_still(other):
+    with writer_lock(into), _held_still(other):
         theirs, ours = there.index(), here.index()
         _refuse_what_does_not_fit(there, here, theirs, ours)
         report = MergeReport()
         wanted = _what_is_new(here, theirs, ours, report)
-        changes = Changes(staged={}, removed=[])
+        changes = Changes()
         for id, entry in wanted.items():
             _stage_episode(there, into, id, entry, changes)
         report.latents = sum(_take_latents(other, into, entry, id) for id, entry in wanted.items())
         if wanted:
             report.added = sorted(wanted)
             note = f"{len(wanted)} episodes taken from {other}"
-            report.operation = history.perform(into, "merge", changes, note).number
-        if not here.index_path.is_file():
-            here.write_index()
+            report.operation = history.begin(into).perform("merge", changes, note).number
+        here.ensure_index()
     return report
 
 
@@ -84,7 +84,7 @@ def _what_is_new(
         elif entry.ingest_key in gone or entry.ingest_content in gone:
             report.removed.append(gone.get(entry.ingest_key) or gone[entry.ingest_content])
         else:
-            id = _free_id(entry, taken)
+            id = free_id(entry.id, taken, entry.source_sha256, entry.content_sha256)
             taken.add(id)
             wanted[id] = entry
             known |= {entry.ingest_key: replace(entry, id=id), entry.ingest_content: replace(entry, id=id)}
@@ -98,11 +98,6 @@ def _told_apart(theirs: EpisodeEntry, ours: EpisodeEntry) -> Iterator[str]:
     words += ["labelled otherwise"] * ((theirs.tags, theirs.outcome) != (ours.tags, ours.outcome))
     if words:
         yield f"{ours.id}: {' and '.join(words)} there; it stays as it is here"
-
-
-def _free_id(entry: EpisodeEntry, taken: set[str]) -> str:
-    suffixes = ("", f"-{entry.source_sha256[:8]}", f"-{entry.source_sha256}", f"-{entry.content_sha256}")
-    return next(entry.id + suffix for suffix in suffixes if entry.id + suffix not in taken)
 
 
 # --- files -------------------------------------------------------------------------------------------------------------------
@@ -125,6 +120,7 @@ def _stage_episode(there: EpisodeStore, into: Path, id: str, entry: EpisodeEntry
     for view in entry.n_frames:
         name = frames_name(view, id)
         changes.staged[name] = history.stage(into, name)
+        shards.verify_shard(there.frames_path(view, entry.id))  # a link would share the damage
         journal.keep_link(there.frames_path(view, entry.id), changes.staged[name])
 
 
@@ -136,6 +132,7 @@ def _take_latents(other: Path, into: Path, entry: EpisodeEntry, id: str) -> int:
             source, target = latents_path(other, view, folder.name, entry.id), latents_path(into, view, folder.name, id)
             with contextlib.suppress(StoreError):  # damaged there: made again here
                 if source.is_file() and _frames_of(source) == entry.frames_sha256[view]:
+                    shards.verify_shard(source)
                     if target.is_file() and _frames_of(target) != entry.frames_sha256[view]:
                         target.unlink()  # left by an episode of that name that is gone
                     journal.keep_link(source, target)
@@ -153,7 +150,7 @@ def _held_still(other: Path) -> Iterator[None]:
     EpisodeStore(other).spec()  # first of all: a folder that is no dataset must not get a lock file
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(StoreError):
-            stack.enter_context(shards.writer_lock(other))
+            stack.enter_context(writer_lock(other))
         yield
 
 

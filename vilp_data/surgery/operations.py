@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vilp_data import shards
-from vilp_data.check.motion import IDLE_S, IDLE_SHARE
-from vilp_data.dataset_split import find_split
+from vilp_data import history, shards
+from vilp_data.dataset_split import find_split, split_by
+from vilp_data.dataset_state import frames_name, steps_name
+from vilp_data.edits import MIN_STEPS, relabelled, require_enough, trimmed
 from vilp_data.episodes import EpisodeEntry, EpisodeStore, write_steps
-from vilp_data.errors import UsageError, nearest
-from vilp_data.surgery import history
-from vilp_data.surgery.dataset_state import frames_name, steps_name
-from vilp_data.surgery.edits import MIN_STEPS, relabelled, trimmed
-from vilp_data.surgery.history import Changes
-from vilp_data.surgery.idle import moving_range
-from vilp_data.surgery.removed import read_removed, removed_bytes, removed_episode, removed_path
+from vilp_data.errors import SplitError, UsageError, nearest
+from vilp_data.history import Changes
+from vilp_data.idle import IDLE_S, IDLE_SHARE, moving_range
+from vilp_data.removed import read_removed, removed_bytes, removed_episode, removed_path
+from vilp_data.split import leaks
+from vilp_data.split_lock import SplitLock
 from vilp_data.types import OUTCOME_TAG, ROLLOUT_TAG
+from vilp_data.writer_lock import writer_lock
 
 MARGIN_S = 0.5
 """Rest that is kept at either end: a policy should see what standing still looks like."""
@@ -41,7 +42,7 @@ class SurgeryReport:
 
 
 @dataclass(frozen=True)
-class Cut:
+class Trim:
     """What a trim leaves of an episode: steps `first` to `end` (one past the last) of the `n_steps` there are now, the first of which is
     step `counted_from` of the episode as it was ingested. `moves` False: nothing moves in it at all, and it is left as it is."""
 
@@ -66,7 +67,7 @@ def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") ->
     not bring them back unless asked to.
 
     Raises UsageError for an unknown id (one that was removed before is none) and where nothing would be left."""
-    with shards.writer_lock(root):
+    with writer_lock(root):
         store, removed = EpisodeStore(root), read_removed(root)
         entries = {entry.id: entry for entry in store.index()}
         report = SurgeryReport()
@@ -78,15 +79,15 @@ def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") ->
             else:
                 raise UsageError(f"no episode called {id!r}", where=root, remedy=nearest(id, entries))
         if not report.changed:
-            _index_again(store)
+            store.ensure_index()
             return report
         if len(report.changed) == len(entries):
             remedy = "delete the folder instead, or keep an episode"
             raise UsageError("no episode would be left", where=root, found=f"{len(entries)} to remove", remedy=remedy)
-        prepared = history.prepare(root)
+        operation, changes = history.begin(root), Changes()
         for id in report.changed:
-            removed[id] = removed_episode(entries[id], reason=reason, operation=prepared[0])
-        changes = Changes(staged={}, removed=[])
+            tick_ns = int(_steps_of(store, entries[id])["log_time_ns"][0])
+            removed[id] = removed_episode(entries[id], tick_ns=tick_ns, reason=reason, operation=operation.number)
         for id in report.changed:
             changes.removed.append(steps_name(id))
             changes.removed += [
@@ -94,7 +95,7 @@ def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") ->
             ]
         _stage_bytes(root, changes, removed_path(root).name, removed_bytes(removed))
         note = f"{counted(report.changed)} removed" + (f": {reason}" if reason else "")
-        report.operation = history.perform(root, "remove", changes, note, prepared=prepared).number
+        report.operation = operation.perform("remove", changes, note).number
         store.write_index()
         report.notes += _sides_left(store)
     return report
@@ -106,11 +107,11 @@ def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") ->
 def plan_trim(
     root: Path, episodes: Sequence[str] = (), *, threshold: float = IDLE_SHARE, margin_s: float = MARGIN_S,
     steps: tuple[int | None, int | None] | None = None,
-) -> list[Cut]:  # fmt: skip
+) -> list[Trim]:  # fmt: skip
     """What `trim_episodes` would leave of each of `episodes` (of all, where none is named). Nothing is written.
 
     Idle ends are found by `idle.moving_range` over low_dim and action, with `margin_s` seconds kept beside the motion; one that is
-    shorter than `check_motion.IDLE_S` stays, as `check` does not mention it either. `steps` names
+    shorter than `idle.IDLE_S` stays, as `check` does not mention it either. `steps` names
     the range to keep instead, as a slice of Python does: (10, None), (None, -5); it counts the steps that ingest gave the episode, so
     that doing it twice does nothing more. Raises UsageError as `trim_episodes`."""
     if not 0 < threshold < 1:
@@ -124,22 +125,23 @@ def plan_trim(
         if steps is not None:
             first, end, _ = slice(*steps).indices(entry.whole_steps)
             first, end = max(first - entry.first_step, 0), min(end - entry.first_step, entry.n_steps)
-            cuts.append(_cut(entry, first, end))
+            require_enough(entry, _steps_of(store, entry), first, end)
+            cuts.append(_trim(entry, first, end))
         else:
-            cuts.append(_idle_cut(store, entry, threshold, margin_s))
+            cuts.append(_idle_trim(store, entry, threshold, margin_s))
     return cuts
 
 
-def trim_episodes(root: Path, cuts: Sequence[Cut]) -> SurgeryReport:
+def trim_episodes(root: Path, cuts: Sequence[Trim]) -> SurgeryReport:
     """Do what `plan_trim` said. Frames files stay as they are, and so do latents; frames that no step sees any more are read by
     nobody: no model, statistic or export.
 
     Raises UsageError for an unknown id, for one that has other steps than when the plan was made, and where too little would be left."""
-    with shards.writer_lock(root):
+    with writer_lock(root):
         store, report = EpisodeStore(root), SurgeryReport()
         entries = {entry.id: entry for entry in store.index()}
         wanted = [cut for cut in cuts if cut.cuts]
-        changes, gone = Changes(staged={}, removed=[]), 0
+        changes, gone = Changes(), 0
         for cut in wanted:
             entry = entries.get(cut.id)
             if entry is None or entry.n_steps != cut.n_steps:
@@ -152,10 +154,10 @@ def trim_episodes(root: Path, cuts: Sequence[Cut]) -> SurgeryReport:
             gone += cut.n_steps - (cut.end - cut.first)
         if report.changed:
             note = f"{counted(report.changed)} trimmed by {gone} steps"
-            report.operation = history.perform(root, "trim", changes, note).number
+            report.operation = history.begin(root).perform("trim", changes, note).number
             store.write_index()
         else:
-            _index_again(store)
+            store.ensure_index()
     return report
 
 
@@ -169,53 +171,56 @@ def parse_steps(text: str) -> tuple[int | None, int | None]:
     return (int(first) if first else None, int(end) if end else None)
 
 
-def _idle_cut(store: EpisodeStore, entry: EpisodeEntry, threshold: float, margin_s: float) -> Cut:
+def _idle_trim(store: EpisodeStore, entry: EpisodeEntry, threshold: float, margin_s: float) -> Trim:
     steps = _steps_of(store, entry)
     columns = [steps["low_dim"], *([steps["action"]] if "action" in steps else [])]
     moving = moving_range(np.concatenate(columns, axis=1).astype(np.float64), steps["valid"], threshold=threshold)
     if moving is None:
-        return _cut(entry, 0, entry.n_steps, moves=False)
+        return _trim(entry, 0, entry.n_steps, moves=False)
     margin, pause = round(margin_s * entry.rate_hz), IDLE_S * entry.rate_hz
     first = max(moving[0] - margin, 0) if moving[0] > pause else 0
     end = min(moving[1] + margin, entry.n_steps) if entry.n_steps - moving[1] > pause else entry.n_steps
     if end - first < MIN_STEPS or not steps["valid"][first:end].any():
         first, end = 0, entry.n_steps
-    return _cut(entry, first, end)
+    return _trim(entry, first, end)
 
 
-def _cut(entry: EpisodeEntry, first: int, end: int, *, moves: bool = True) -> Cut:
-    return Cut(entry.id, first, end, entry.n_steps, entry.rate_hz, entry.first_step, moves=moves)
+def _trim(entry: EpisodeEntry, first: int, end: int, *, moves: bool = True) -> Trim:
+    return Trim(entry.id, first, end, entry.n_steps, entry.rate_hz, entry.first_step, moves=moves)
 
 
 # --- relabel ---------------------------------------------------------------------------------------------------------------
 
 
 def relabel_episodes(
-    root: Path, episodes: Sequence[str], *, labels: Mapping[str, str] | None = None, unset: Iterable[str] = ()
-) -> SurgeryReport:
+    root: Path, episodes: Sequence[str], *, labels: Mapping[str, str] | None = None, unset: Iterable[str] = (), force: bool = False
+) -> SurgeryReport:  # fmt: skip
     """Set and take away tags of `episodes`. The outcome follows the tag `success`. Labels are kept when the log is ingested again.
 
-    Raises UsageError for an unknown id, a tag that is set and unset, and the tag by which a policy's own episodes are known."""
+    Raises UsageError for an unknown id, a tag that is set and unset, the tag by which a policy's own episodes are known, and, unless
+    with `force`, where the split could no longer be kept: it needs a tag that would be gone, or a group would be on both sides."""
     labels, unset = dict(labels or {}), tuple(dict.fromkeys(unset))
     _refuse_labels(labels, unset)
-    with shards.writer_lock(root):
-        store, report = EpisodeStore(root), SurgeryReport()
-        changes = Changes(staged={}, removed=[])
+    with writer_lock(root):
+        store, report, changes = EpisodeStore(root), SurgeryReport(), Changes()
+        before, lock = {entry.id: entry for entry in store.index()}, find_split(root)
+        after = dict(before)
         for entry in _chosen(store, episodes, all_by_default=False):
-            labelled = relabelled(entry, labels=labels, unset=unset)
-            if labelled != entry:
-                _stage_steps(root, changes, labelled, _steps_of(store, entry))
+            after[entry.id] = relabelled(entry, labels=labels, unset=unset)
+            if after[entry.id] != entry:
                 report.changed.append(entry.id)
             missing = [tag for tag in unset if tag not in entry.tags]
             report.notes += [f"{entry.id}: has no tag {', '.join(map(repr, missing))}"] if missing else []
+        if lock is not None and not force:
+            _refuse_breaking_the_split(root, lock, before, after)
+        for id in report.changed:
+            _stage_steps(root, changes, after[id], _steps_of(store, before[id]))
         if report.changed:
             said = [f"{tag} = {value}" for tag, value in labels.items()] + [f"no {tag}" for tag in unset]
             note = f"{counted(report.changed)} relabelled: {', '.join(said)}"
-            report.operation = history.perform(root, "relabel", changes, note).number
-            store.write_index()
-            report.notes += _about_labels(root, labels, unset)
-        else:
-            _index_again(store)
+            report.operation = history.begin(root).perform("relabel", changes, note).number
+            report.notes += _about_labels(lock, labels, unset)
+        store.ensure_index()
     return report
 
 
@@ -225,6 +230,12 @@ def _refuse_labels(labels: Mapping[str, str], unset: Sequence[str]) -> None:
     both = sorted({*labels}.intersection(unset))
     if both:
         raise UsageError("a label that is set and taken away", found=both[0], remedy="name it once")
+    if not all(tag.strip() for tag in (*labels, *unset)):
+        raise UsageError("a label without a name", remedy="--set KEY=VALUE, such as --set operator=anna")
+    if labels.get(OUTCOME_TAG, "true") not in ("true", "false"):
+        found = f"{OUTCOME_TAG} = {labels[OUTCOME_TAG]!r}"
+        remedy = "true or false; `--unset success` where nobody can tell"
+        raise UsageError("an episode succeeded or failed", found=found, remedy=remedy)
     name, value = ROLLOUT_TAG
     if name in unset or name in labels:
         raise UsageError(
@@ -233,8 +244,28 @@ def _refuse_labels(labels: Mapping[str, str], unset: Sequence[str]) -> None:
         )
 
 
-def _about_labels(root: Path, labels: Mapping[str, str], unset: Sequence[str]) -> list[str]:
-    notes, lock = [], find_split(root)
+def _refuse_breaking_the_split(
+    root: Path, lock: SplitLock, before: Mapping[str, EpisodeEntry], after: Mapping[str, EpisodeEntry]
+) -> None:
+    """UsageError where labels leave an episode without a tag that the split needs, or bring a group to both sides that was on one."""
+    needed = [*lock.strata, *([lock.group_by] if lock.group_by else [])]
+    broken = [
+        f"{id} would have no {tag!r}"
+        for tag in needed
+        for id in after
+        if tag in before[id].tags and tag not in after[id].tags
+    ]
+    known = leaks(lock, split_by(before.values(), lock))
+    broken += [leak for leak in leaks(lock, split_by(after.values(), lock)) if leak not in known]
+    if broken:
+        raise UsageError(
+            "these labels would break the split", where=root / "split.lock.json", found="; ".join(broken[:3]),
+            remedy="relabel the whole group in one call; or --force, and then `vilp-data split --redraw`",
+        )  # fmt: skip
+
+
+def _about_labels(lock: SplitLock | None, labels: Mapping[str, str], unset: Sequence[str]) -> list[str]:
+    notes = []
     drawn_by = {*(lock.strata if lock else ()), *([lock.group_by] if lock and lock.group_by else [])}.intersection(
         {*labels, *unset}
     )
@@ -243,7 +274,7 @@ def _about_labels(root: Path, labels: Mapping[str, str], unset: Sequence[str]) -
         notes.append(
             f"the split was drawn by {tag!r}: nothing changes sides; `vilp-data split --check` says if it still fits"
         )
-    if labels.get(OUTCOME_TAG, "").lower() == "false":
+    if labels.get(OUTCOME_TAG) == "false":
         notes.append("failures that are stored stay where they are; `vilp-data remove` takes them out of training")
     return notes
 
@@ -283,14 +314,11 @@ def _stage_bytes(root: Path, changes: Changes, name: str, data: bytes) -> None:
     shards.write_atomic(changes.staged[name], data)
 
 
-def _index_again(store: EpisodeStore) -> None:
-    """Write the index that a killed operation could not write any more."""
-    if not store.index_path.is_file():
-        store.write_index()
-
-
 def _sides_left(store: EpisodeStore) -> list[str]:
-    lock = find_split(store.root)
+    try:
+        lock = find_split(store.root)
+    except SplitError as error:  # damaged: a remove does not need it
+        return [str(error)]
     if lock is None:
         return []
     there = {lock.assignment.get(entry.id) for entry in store.index()}

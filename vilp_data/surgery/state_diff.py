@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from vilp_data.surgery.dataset_state import DatasetState, EpisodeState
+from vilp_data.dataset_state import DatasetState, EpisodeState
 
 Change = tuple[str | None, str | None]
 """A value in the first state and in the second; None where it is not there."""

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from vilp_data.decode import is_image
-from vilp_data.decode.depth import is_depth, measured_depth
+from vilp_data.decode.depth import is_depth, is_grey16, measured_depth
 from vilp_data.decode.images import decode_image, encoded_image
-from vilp_data.decode.video import Frames, RgbReader, VideoDecoder, is_video
+from vilp_data.decode.video import Frames, RgbReader, VideoDecoder
+from vilp_data.decode.video_packet import is_video
 from vilp_data.errors import DecodeError
 from vilp_data.types import U8, Message
 from vilp_data.viewer.canvas import Canvas, entity_of
@@ -35,7 +36,7 @@ class LogImages:
         """Raises DecodeError for an image that cannot be read; a video's packets without a picture are told by `end`."""
         if is_video(message):
             self._draw_packet(message)
-        elif is_depth(message):
+        elif is_depth(message) or is_grey16(message):
             self._canvas.depth_image(entity_of(message.topic), message.log_time_ns, *_as_png(message))
         else:
             encoded = encoded_image(message)

@@ -10,17 +10,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from vilp_data import shards
-from vilp_data.errors import BusyError, StoreError
+from vilp_data.errors import StoreError
 
 JOURNAL_FORMAT = 1
-WAIT_S = 10.0
-"""How long a reader waits for another process to finish its renames: these take milliseconds."""
-
 Move = tuple[str, str]
 """A file's name now and the one to come, both below the dataset."""
 
@@ -38,11 +34,12 @@ def held_folder(root: Path, number: int) -> Path:
     return root / "history" / "held" / f"{number:04d}"
 
 
-def commit(root: Path, moves: Sequence[Move]) -> None:
-    """Do all these renames, in order, or none. Every source must be on disk, whole. Call inside `shards.writer_lock(root)`."""
+def commit(root: Path, moves: Sequence[Move], *, drop_index: bool = False) -> None:
+    """Do all these renames, in order, or none, and delete the index of episodes before where it will be wrong. Every source must be on
+    disk, whole. Call inside `writer_lock(root)`."""
     for folder in sorted({(root / now).parent for now, _ in moves}):
         shards.sync_folder(folder)
-    table = {"format": JOURNAL_FORMAT, "moves": [list(move) for move in moves]}
+    table = {"format": JOURNAL_FORMAT, "moves": [list(move) for move in moves], "drop_index": drop_index}
     shards.write_atomic(pending_path(root), (json.dumps(table, indent=1) + "\n").encode())
     _finish(root)
 
@@ -53,25 +50,10 @@ def is_pending(root: Path) -> bool:
 
 
 def settle(root: Path) -> None:
-    """Finish what a killed process had committed, and clear away what it had only prepared. Call inside `shards.writer_lock`."""
+    """Finish what a killed process had committed, and clear away what it had only prepared. Call inside `writer_lock`."""
     if is_pending(root):
         _finish(root)
     shutil.rmtree(staged_folder(root), ignore_errors=True)
-
-
-def await_settled(root: Path) -> None:
-    """Before reading: see that no operation is half done. Where its process is gone, this one finishes it.
-
-    Raises BusyError where another process takes longer than WAIT_S, StoreError where the folder cannot be written."""
-    deadline = time.monotonic() + WAIT_S
-    while is_pending(root):
-        try:
-            with shards.writer_lock(root):
-                return
-        except BusyError:
-            if time.monotonic() > deadline:
-                raise
-        time.sleep(0.01)
 
 
 def keep_link(source: Path, target: Path) -> None:
@@ -95,12 +77,13 @@ def _finish(root: Path) -> None:
         if table["format"] != JOURNAL_FORMAT:
             raise ValueError(f"format {table['format']!r}, this is {JOURNAL_FORMAT}")
         moves = [(str(now), str(then)) for now, then in table["moves"]]
+        drop_index = bool(table.get("drop_index", True))  # not said by an older version
     except (ValueError, KeyError, TypeError) as error:
         remedy = "finish with the version that began it, or restore the folder from a backup"
         raise StoreError(
             "an operation was left half done, and cannot be read", where=path, found=str(error), remedy=remedy
         ) from error
-    if any(name.startswith("episodes/steps/") for move in moves for name in move):
+    if drop_index:
         (root / "episodes" / "index.parquet").unlink(missing_ok=True)  # derived; one that is wrong would be believed
     try:
         _rename_all(root, moves)

@@ -1,10 +1,12 @@
-"""What of a dataset is exported, and its rows: whole episodes, or the runs of valid steps between masked ones."""
+"""What of a dataset is exported, and its rows: segments of episodes, which are whole or the runs of valid steps between masked ones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import json
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SpecError, StoreError, UsageError
 from vilp_data.split_lock import Side, SplitLock
-from vilp_data.types import F32, F64, I32, I64, U8, Bool, is_rollout
+from vilp_data.types import F32, F64, I32, I64, RATE_TOLERANCE, U8, Bool, is_rollout
 from vilp_data.windows import valid_runs
 
 Masked = Literal["cut", "mark", "refuse"]
@@ -42,8 +44,8 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Steps first, …, end - 1 of a stored episode: one episode of the export."""
+class Segment:
+    """Steps first, …, end - 1 of a stored episode, as it is today: one episode of the export."""
 
     entry: EpisodeEntry
     first: int
@@ -63,21 +65,41 @@ class Piece:
         """Whether its last row is the last step of the episode, rather than the one before a masked step."""
         return self.end == self.entry.n_steps
 
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Where it comes from, the same in every format. Steps are counted as ingest did, as `trim --steps` and `check` count them, from
+        first_step up to the one before end_step."""
+        entry = self.entry
+        return {
+            "episode": entry.id, "first_step": entry.first_step + self.first, "end_step": entry.first_step + self.end,
+            "side": self.side, "outcome": entry.outcome, "tags": dict(sorted(entry.tags.items())), "rate_hz": entry.rate_hz,
+            "source": entry.source, "source_episode": entry.source_episode, "source_sha256": entry.source_sha256, "key": entry.key,
+        }  # fmt: skip
+
+    @property
+    def flat_provenance(self) -> dict[str, str | int | float]:
+        """The same for formats that know no tables: tags as JSON, no side as an empty text."""
+        told = self.provenance
+        return {**told, "side": self.side or "", "tags": json.dumps(told["tags"], sort_keys=True)}
+
     def __str__(self) -> str:
-        return self.entry.id if self.is_whole else f"{self.entry.id}, steps {self.first} to {self.end - 1}"
+        if self.is_whole:
+            return self.entry.id
+        told = self.provenance
+        return f"{self.entry.id}, steps {told['first_step']} to {told['end_step'] - 1}"
 
 
 @dataclass
 class Chosen:
     """What is exported, and what is not.
 
-    pieces    training episodes, validation episodes, those without a side; each by id
+    segments    training episodes, validation episodes, those without a side; each by id
     left_out  reason -> ids of episodes of which nothing is exported
     masked    id -> number of masked steps, of episodes that have some
     cut_away  id -> valid steps that go with them, in runs shorter than SHORTEST
     """
 
-    pieces: list[Piece] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
     left_out: dict[str, list[str]] = field(default_factory=dict)
     masked: dict[str, int] = field(default_factory=dict)
     cut_away: dict[str, int] = field(default_factory=dict)
@@ -85,23 +107,23 @@ class Chosen:
 
     @property
     def n_rows(self) -> int:
-        return sum(piece.n_rows for piece in self.pieces)
+        return sum(segment.n_rows for segment in self.segments)
 
     @property
     def has_action(self) -> bool:
-        return any(piece.entry.has_action for piece in self.pieces)
+        return any(segment.entry.has_action for segment in self.segments)
 
     @property
-    def unlabelled(self) -> list[Piece]:
-        return [piece for piece in self.pieces if not piece.entry.has_action] if self.has_action else []
+    def unlabelled(self) -> list[Segment]:
+        return [segment for segment in self.segments if not segment.entry.has_action] if self.has_action else []
 
-    def on(self, side: Side | None) -> list[Piece]:
-        return [piece for piece in self.pieces if piece.side == side]
+    def on(self, side: Side | None) -> list[Segment]:
+        return [segment for segment in self.segments if segment.side == side]
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of a piece.
+    """The rows of a segment.
 
     frames       view -> uint8 [n,H,W,C], the episode's stored frames
     shown        view -> int32 [R]: which of them each row shows
@@ -128,7 +150,7 @@ class Rows:
 
 
 def choose(store: EpisodeStore, choice: Choice) -> Chosen:
-    """The pieces to export. Raises UsageError where nothing is left or `masked = "refuse"` meets masked steps, SplitError where a
+    """The segments to export. Raises UsageError where nothing is left or `masked = "refuse"` meets masked steps, SplitError where a
     side is asked for and no split was drawn."""
     chosen = Chosen(lock=read_split(store.root) if choice.split != "all" or find_split(store.root) else None)
     entries = [entry for entry in store.index() if not _left_out(entry, choice, chosen)]
@@ -136,11 +158,11 @@ def choose(store: EpisodeStore, choice: Choice) -> Chosen:
         chosen.left_out["without actions"] = [entry.id for entry in entries if not entry.has_action]
         entries = [entry for entry in entries if entry.has_action]
     for entry in entries:
-        chosen.pieces += _pieces(store, entry, choice, chosen)
+        chosen.segments += _segments(store, entry, choice, chosen)
     order = {"train": 0, "val": 1, None: 2}
-    chosen.pieces.sort(key=lambda piece: (order[piece.side], piece.entry.id, piece.first))
+    chosen.segments.sort(key=lambda segment: (order[segment.side], segment.entry.id, segment.first))
     chosen.left_out = {reason: ids for reason, ids in chosen.left_out.items() if ids}
-    if not chosen.pieces:
+    if not chosen.segments:
         found = "; ".join(f"{len(ids)} {reason}" for reason, ids in chosen.left_out.items()) or "no episode"
         raise UsageError(
             "nothing to export", where=store.root, found=found, remedy="see --split and the --with-… options"
@@ -162,9 +184,9 @@ def _left_out(entry: EpisodeEntry, choice: Choice, chosen: Chosen) -> bool:
     return reason is not None
 
 
-def _pieces(store: EpisodeStore, entry: EpisodeEntry, choice: Choice, chosen: Chosen) -> list[Piece]:
+def _segments(store: EpisodeStore, entry: EpisodeEntry, choice: Choice, chosen: Chosen) -> list[Segment]:
     side = chosen.lock.assignment.get(entry.id) if chosen.lock else None
-    whole = Piece(entry, 0, entry.n_steps, side)
+    whole = Segment(entry, 0, entry.n_steps, side)
     if entry.n_valid == entry.n_steps:
         return [whole]
     chosen.masked[entry.id] = entry.n_steps - entry.n_valid
@@ -181,34 +203,36 @@ def _pieces(store: EpisodeStore, entry: EpisodeEntry, choice: Choice, chosen: Ch
     short = sum(end - first for first, end in runs if end - first < SHORTEST)
     if short:
         chosen.cut_away[entry.id] = short
-    pieces = [Piece(entry, first, end, side) for first, end in runs if end - first >= SHORTEST]
-    if not pieces:
+    segments = [Segment(entry, first, end, side) for first, end in runs if end - first >= SHORTEST]
+    if not segments:
         chosen.left_out.setdefault("no two valid steps in a row", []).append(entry.id)
-    return pieces
+    return segments
 
 
-def read_pieces(store: EpisodeStore, pieces: Sequence[Piece], n_action: int | None) -> Iterator[tuple[Piece, Rows]]:
-    """Each piece with its rows, one episode in memory at a time, every byte checksummed.
+def read_segments(
+    store: EpisodeStore, segments: Sequence[Segment], n_action: int | None
+) -> Iterator[tuple[Segment, Rows]]:
+    """Each segment with its rows, one episode in memory at a time, every byte checksummed.
 
     `n_action` is the width of actions, None where the export has none. Raises StoreError for files that are damaged or not those
     of the index."""
     read: tuple[str, dict[str, U8]] | None = None
-    for piece in pieces:
-        entry = piece.entry
+    for segment in segments:
+        entry = segment.entry
         if read is None or read[0] != entry.id:
             read = entry.id, {view: store.read_frames(view, entry) for view in entry.frames_sha256}
-        yield piece, _rows(store, piece, read[1], n_action)
+        yield segment, _rows(store, segment, read[1], n_action)
 
 
-def _rows(store: EpisodeStore, piece: Piece, frames: Mapping[str, U8], n_action: int | None) -> Rows:
-    entry, rows = piece.entry, slice(piece.first, piece.end)
+def _rows(store: EpisodeStore, segment: Segment, frames: Mapping[str, U8], n_action: int | None) -> Rows:
+    entry, rows = segment.entry, slice(segment.first, segment.end)
     shards.verify_shard(store.steps_path(entry.id))
     steps = open_steps(store, entry, frames)
     valid = np.array(steps["valid"][rows])
     low_dim, action = np.array(steps["low_dim"][rows]), None
     low_dim[~valid] = np.nan  # what is stored there is nobody's measurement
     if n_action is not None:
-        action = np.full((piece.n_rows, n_action), np.nan, np.float32)
+        action = np.full((segment.n_rows, n_action), np.nan, np.float32)
         if entry.has_action:
             action[valid] = steps["action"][rows][valid]
     return Rows(
@@ -226,8 +250,8 @@ def _rows(store: EpisodeStore, piece: Piece, frames: Mapping[str, U8], n_action:
 
 @dataclass(frozen=True)
 class Shapes:
-    """What every piece of an export has in common: view -> [H,W,C]; widths of low_dim, action and state (None where there is none,
-    or, for the state, where pieces differ)."""
+    """What every segment of an export has in common: view -> [H,W,C]; widths of low_dim, action and state (None where there is none,
+    or, for the state, where segments differ)."""
 
     views: Mapping[str, tuple[int, ...]]
     low_dim: int
@@ -236,8 +260,8 @@ class Shapes:
 
 
 def common_shapes(store: EpisodeStore, chosen: Chosen) -> Shapes:
-    """The shapes of all pieces. Raises StoreError where two episodes differ: one table cannot hold them."""
-    entries = list({piece.entry.id: piece.entry for piece in chosen.pieces}.values())
+    """The shapes of all segments. Raises StoreError where two episodes differ: one table cannot hold them."""
+    entries = list({segment.entry.id: segment.entry for segment in chosen.segments}.values())
     found = [_shapes(store, entry) for entry in entries]
     first = found[0]
     for entry, shapes in zip(entries, found, strict=True):
@@ -266,16 +290,16 @@ def _shapes(store: EpisodeStore, entry: EpisodeEntry) -> Shapes:
     return Shapes(views, tensors["low_dim"].shape[1], width["action"], width["state"])
 
 
-def one_rate_hz(pieces: Sequence[Piece]) -> float:
-    """The rate of the rows. SpecError where episodes differ by more than a millionth: one table has one rate."""
-    rates = sorted({piece.entry.rate_hz for piece in pieces})
-    if rates[-1] / rates[0] - 1 > 1e-6:
+def common_rate_hz(segments: Sequence[Segment]) -> float:
+    """The rate of the rows: that of all episodes; where they scatter as much as one dataset may (`types.RATE_TOLERANCE` around the first
+    that was ingested), the roundest number among them near their median. SpecError where they differ by more."""
+    rates = sorted({segment.entry.rate_hz for segment in segments})
+    if rates[-1] / rates[0] > (1 + RATE_TOLERANCE) / (1 - RATE_TOLERANCE):
         found = f"{rates[0]:g} to {rates[-1]:g} steps a second"
         raise SpecError(
             "episodes of different rates", found=found, remedy="state rate_hz in the task TOML, and ingest again"
         )
-    return rates[0]
-
-
-Advance = Callable[[int, int], None]
-"""Told how many rows are done, and of how many."""
+    median = statistics.median(segment.entry.rate_hz for segment in segments)
+    if rates[-1] / rates[0] - 1 <= 1e-6:
+        return rates[0]
+    return next((rate for digits in range(7) if rates[0] <= (rate := round(median, digits)) <= rates[-1]), median)

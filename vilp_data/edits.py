@@ -54,15 +54,15 @@ class Edits:
         return self.set.get(OUTCOME_TAG, "false").lower() != "false"
 
 
-def edits_of(entry: EpisodeEntry) -> Edits:
-    """The decisions that an entry's `edits` remember."""
-    labels, trim = entry.edits.get("labels", {}), entry.edits.get("trim", {})
+def edits_of(remembered: Mapping[str, Any]) -> Edits:
+    """The decisions that `EpisodeEntry.edits` remember."""
+    labels, trim = remembered.get("labels", {}), remembered.get("trim", {})
     return Edits(labels.get("set", {}), tuple(labels.get("unset", ())), trim.get("start_ns"), trim.get("end_ns"))
 
 
 def relabelled(entry: EpisodeEntry, *, labels: Mapping[str, str], unset: tuple[str, ...] = ()) -> EpisodeEntry:
     """The entry with tags set and taken away; the outcome follows the tag `success`. Labels that say what the log says are none."""
-    before = edits_of(entry)
+    before = edits_of(entry.edits)
     log_tags = entry.edits.get("log_tags", dict(entry.tags))
     log_outcome = entry.edits.get("log_outcome", entry.outcome)
     tags = {tag: value for tag, value in {**entry.tags, **labels}.items() if tag not in unset}
@@ -78,13 +78,23 @@ def relabelled(entry: EpisodeEntry, *, labels: Mapping[str, str], unset: tuple[s
     return replace(entry, tags=tags, outcome=outcome_of(tags) if judged else log_outcome, edits=edits)
 
 
+def restated(entry: EpisodeEntry, tags: Mapping[str, str]) -> EpisodeEntry:
+    """The entry with what its log says of it today, and the labels that people set on top."""
+    if dict(tags) == entry.edits.get("log_tags", entry.tags):
+        return entry
+    labels = edits_of(entry.edits)
+    edits = {name: value for name, value in entry.edits.items() if name not in ("labels", "log_tags", "log_outcome")}
+    plain = replace(entry, tags=dict(tags), outcome=outcome_of(tags), edits=edits)
+    return relabelled(plain, labels=labels.set, unset=labels.unset)
+
+
 def trimmed(
     entry: EpisodeEntry, steps: Arrays, first: int, end: int
 ) -> tuple[EpisodeEntry, dict[str, npt.NDArray[Any]]]:
     """Entry and arrays of the steps `first` to `end` (one past the last) alone; `source_index` counts from the first frame kept.
 
     Raises UsageError where too little would be left."""
-    _require_enough(entry, steps, first, end)
+    require_enough(entry, steps, first, end)
     if (first, end) == (0, entry.n_steps):
         return entry, dict(steps)
     kept = {name: array[first:end] for name, array in steps.items()}
@@ -143,7 +153,8 @@ def _rebased(source_index: I32, n_frames: int) -> tuple[I32, int, int]:
     return np.where(source_index >= 0, source_index - first, source_index).astype(np.int32), first, last - first + 1
 
 
-def _require_enough(entry: EpisodeEntry, steps: Arrays, first: int, end: int) -> None:
+def require_enough(entry: EpisodeEntry, steps: Arrays, first: int, end: int) -> None:
+    """Raise UsageError unless `first` to `end` are steps of the episode, enough of them to learn from."""
     if not 0 <= first < end <= entry.n_steps:
         found = f"steps {first} to {end} of an episode of {entry.n_steps}"
         raise UsageError(

@@ -5,7 +5,7 @@ Every verb that changes a dataset writes one. It holds the command line, the tim
 found when the next one begins, and recorded as `found`.
 
     ingest             records around work that goes on for hours: `recording`
-    everything else    is one exchange of files, all or none: `perform`
+    everything else    is one exchange of files, all or none: `begin(root).perform(…)`
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ import datetime
 import json
 import shlex
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vilp_data import shards
+from vilp_data import journal, shards
+from vilp_data.dataset_state import FILES, DatasetState, dumps, read_state
 from vilp_data.errors import StoreError, UsageError
-from vilp_data.surgery import journal
-from vilp_data.surgery.dataset_state import FILES, DatasetState, dumps, read_state
+from vilp_data.writer_lock import await_settled
 
 HISTORY_FORMAT = 1
 FOUND = "found"
+Touched = Mapping[str, tuple[str, str]]
+"""Name of a file below the dataset -> its checksum before an operation and after it; "" where there is none."""
+
 _PROGRAMS = ("vilp-data", "vilp-models")
 
 
@@ -40,7 +43,7 @@ class HistoryEntry:
     when         UTC, ISO 8601, to the second
     note         what came of it, in words
     before       digest of the state before; after, n_episodes, n_steps of the state after it
-    undoes       of an undo: the operation it took back
+    undoes       of an undo: the operation it took back, which may be an undo itself
     interrupted  it was stopped before its end; what it had finished is what it did
     state        the state after; None where `gc` gave it up
     """
@@ -57,6 +60,7 @@ class HistoryEntry:
     undoes: int | None = None
     interrupted: bool = False
     state: DatasetState | None = None
+    touched: Touched | None = None
 
     def to_json(self) -> bytes:
         table = {**self.__dict__, "format": HISTORY_FORMAT, "state": self.state and self.state.to_json()}
@@ -69,10 +73,16 @@ class HistoryEntry:
             table = json.loads(data)
             if (version := table.pop("format")) != HISTORY_FORMAT:
                 raise ValueError(f"format {version!r}, this is {HISTORY_FORMAT}")
-            state = table.pop("state")
-            return cls(**table, state=None if state is None else DatasetState.from_json(state))
+            state, touched = table.pop("state"), table.pop("touched", None)
+            return cls(
+                **table,
+                state=None if state is None else DatasetState.from_json(state),
+                touched=None if touched is None else {name: (was, made) for name, (was, made) in touched.items()},
+            )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            remedy = "restore it from a backup; the dataset itself does not need it, but it cannot be undone past here"
+            remedy = (
+                "the dataset itself does not need it, nor does the undo of later operations; what came before it stays"
+            )
             raise StoreError(
                 "not an entry of a dataset's history", where=where, found=repr(error), remedy=remedy
             ) from error
@@ -97,10 +107,28 @@ def read_entry(root: Path, number: int) -> HistoryEntry:
     return HistoryEntry.from_json(path.read_bytes(), where=path)
 
 
-def read_history(root: Path) -> list[HistoryEntry]:
-    """Every operation, oldest first. Raises StoreError where a file is damaged."""
-    journal.await_settled(root)
-    return [read_entry(root, number) for number in numbers(root)]
+def read_history(root: Path, damaged: list[str] | None = None) -> list[HistoryEntry]:
+    """Every operation, oldest first. Entries that cannot be read go to `damaged`, in words; without it the first of them is raised, as
+    StoreError."""
+    await_settled(root)
+    entries = []
+    for number in numbers(root):
+        try:
+            entries.append(read_entry(root, number))
+        except StoreError as error:
+            if damaged is None:
+                raise
+            damaged.append(str(error))
+    return entries
+
+
+def read_back(root: Path) -> list[HistoryEntry]:
+    """The operations since the last whose entry cannot be read, oldest first: what an undo can know of."""
+    entries: list[HistoryEntry] = []
+    with contextlib.suppress(StoreError):
+        for number in reversed(numbers(root)):
+            entries.append(read_entry(root, number))
+    return entries[::-1]
 
 
 def state_after(root: Path, number: int) -> DatasetState:
@@ -115,15 +143,15 @@ def state_after(root: Path, number: int) -> DatasetState:
     return state
 
 
-# --- writing: inside shards.writer_lock(root) --------------------------------------------------------------------------------
+# --- writing: inside writer_lock(root) ----------------------------------------------------------------------------------------
 
 
 @dataclass
 class Changes:
     """Files to exchange: `staged` gives each name below the dataset its new file, `removed` are names to take away."""
 
-    staged: dict[str, Path]
-    removed: list[str]
+    staged: dict[str, Path] = field(default_factory=dict)
+    removed: list[str] = field(default_factory=list)
 
 
 def stage(root: Path, name: str) -> Path:
@@ -131,46 +159,56 @@ def stage(root: Path, name: str) -> Path:
     return journal.staged_folder(root) / "new" / name
 
 
-def perform(
-    root: Path, what: str, changes: Changes, note: str, *, undoes: int | None = None,
-    prepared: tuple[int, DatasetState] | None = None,
-) -> HistoryEntry:  # fmt: skip
-    """Do `changes`, all or none, and record them under `what`; `note` says in words what they are. What they replace or take away is
-    held. `prepared` is what `prepare` said, where it was asked already."""
-    number, before = prepared or prepare(root)
-    overlay: dict[str, Path | None] = {**changes.staged, **dict.fromkeys(changes.removed)}
-    after = read_state(root, overlay)
-    entry = _entry(number, what, note, before, after, undoes=undoes)
-    held = f"history/held/{number:04d}"
-    moves: list[journal.Move] = []
-    for name in sorted(set(changes.staged) | set(changes.removed)):
-        if name in changes.removed:
-            moves.append((name, f"{held}/{name}"))
-        elif (root / name).is_file():
-            kept = journal.staged_folder(root) / "old" / name
-            journal.keep_link(root / name, kept)
-            moves.append((str(kept.relative_to(root)), f"{held}/{name}"))
-    moves += [(str(path.relative_to(root)), name) for name, path in sorted(changes.staged.items())]
-    recorded = journal.staged_folder(root) / "entry.json"
-    shards.write_atomic(recorded, entry.to_json())
-    moves.append((str(recorded.relative_to(root)), str(entry_path(root, number).relative_to(root))))
-    journal.commit(root, moves)
-    return entry
+@dataclass(frozen=True)
+class Operation:
+    """The operation that begins now: its number, and the state it begins with."""
+
+    root: Path
+    number: int
+    before: DatasetState
+
+    def perform(self, what: str, changes: Changes, note: str, *, undoes: int | None = None) -> HistoryEntry:
+        """Do `changes`, all or none, and record them under `what`; `note` says in words what they are. What they replace or take away
+        is held. Where they touch episodes, or are an undo, the index goes with them: it is to be written last of all, and one that is
+        missing says that the process was stopped before."""
+        overlay: dict[str, Path | None] = {**changes.staged, **dict.fromkeys(changes.removed)}
+        entry = _entry(self.number, what, note, self.before, read_state(self.root, overlay), undoes=undoes)
+        held = journal.held_folder(self.root, self.number).relative_to(self.root)
+        moves: list[journal.Move] = []
+        for name in sorted(overlay):
+            if name in changes.removed:
+                moves.append((name, f"{held}/{name}"))
+            elif (self.root / name).is_file():
+                kept = journal.staged_folder(self.root) / "old" / name
+                journal.keep_link(self.root / name, kept)
+                moves.append((str(kept.relative_to(self.root)), f"{held}/{name}"))
+        moves += [(str(path.relative_to(self.root)), name) for name, path in sorted(changes.staged.items())]
+        recorded = journal.staged_folder(self.root) / "entry.json"
+        shards.write_atomic(recorded, entry.to_json())
+        moves.append(
+            (str(recorded.relative_to(self.root)), str(entry_path(self.root, self.number).relative_to(self.root)))
+        )
+        drop_index = undoes is not None or any(name.startswith("episodes/") for name in overlay)
+        journal.commit(self.root, moves, drop_index=drop_index)
+        return entry
+
+    def record(self, what: str, note: str) -> HistoryEntry:
+        """Record an operation that changed no file of the state, as `gc`."""
+        entry = _entry(self.number, what, note, self.before, self.before)
+        shards.write_atomic(entry_path(self.root, self.number), entry.to_json())
+        return entry
 
 
-def prepare(root: Path) -> tuple[int, DatasetState]:
-    """The number of the operation that begins now, and the state it begins with; one that was killed, and changes that no verb made,
-    are recorded before."""
+def begin(root: Path) -> Operation:
+    """The operation that begins now. One that was killed, and changes that no verb made, are recorded before it."""
     _close(root, interrupted=True)
-    state, last = read_state(root), _last(root)
-    if state.digest != (last.after if last else DatasetState().digest):
-        number = last.number + 1 if last else 1
-        before = last.state or DatasetState() if last else DatasetState()
-        note = "changed by no verb since" if last else "as it was before its history began"
-        entry = _entry(number, FOUND, note, before, state, command="", before_digest=last.after if last else None)
+    (number, before), state = _last(root), read_state(root)
+    if state.digest != before.digest:
+        number += 1
+        note = "changed by no verb since" if before.episodes or before.files else "as it was before its history began"
+        entry = _entry(number, FOUND, note, before, state, command="")
         shards.write_atomic(entry_path(root, number), entry.to_json())
-        return number + 1, state
-    return (last.number + 1 if last else 1), state
+    return Operation(root, number + 1, state)
 
 
 class Recording:
@@ -181,14 +219,14 @@ class Recording:
         self.hold: Path | None = None
 
     def begin(self) -> None:
-        """Before the first change. Goes on with a killed operation of the same kind, whose changes it then records with its own."""
+        """Before the first change. Goes on with a killed operation of the same command, whose changes it then records with its own;
+        one of another command is an operation of its own, and was interrupted."""
         if self.hold is not None:
             return
         open_ = _read_open(self._root)
-        closed = open_ is not None and entry_path(self._root, open_["number"]).is_file()
-        if open_ is None or closed or open_["what"] != self._what:
-            number, _ = prepare(self._root)
-            open_ = {"number": number, "what": self._what, "command": command_line(), "when": _now()}
+        this = {"what": self._what, "command": command_line()}
+        if open_ is None or this.items() - open_.items() or entry_path(self._root, open_["number"]).is_file():
+            open_ = {"number": begin(self._root).number, "when": _now(), **this}
             shards.write_atomic(_open_path(self._root), dumps(open_))
         self.hold = journal.held_folder(self._root, open_["number"])
 
@@ -208,14 +246,6 @@ def recording(root: Path, what: str) -> Iterator[Recording]:
         finished = True
     finally:
         _close(root, interrupted=not finished)  # also where a killed one had done all there was to do
-
-
-def record(root: Path, what: str, note: str) -> HistoryEntry:
-    """Record an operation that changed no file of the state, as `gc`."""
-    number, state = prepare(root)
-    entry = _entry(number, what, note, state, state)
-    shards.write_atomic(entry_path(root, number), entry.to_json())
-    return entry
 
 
 def command_line() -> str:
@@ -243,32 +273,39 @@ def _close(root: Path, *, interrupted: bool) -> None:
     open_ = _read_open(root)
     if open_ is None:
         return
-    number, last, state = int(open_["number"]), _last(root), read_state(root)
-    before = (last and last.state) or DatasetState()
-    if entry_path(root, number).is_file() or state.digest == (last.after if last else DatasetState().digest):
-        _open_path(root).unlink()
-        return
-    entry = _entry(
-        number, open_["what"], _counted(before, state), before, state, command=open_["command"], when=open_["when"],
-        interrupted=interrupted, before_digest=last.after if last else None,
-    )  # fmt: skip
-    shards.write_atomic(entry_path(root, number), entry.to_json())
+    number, before, state = int(open_["number"]), _last(root)[1], read_state(root)
+    if not entry_path(root, number).is_file() and state.digest != before.digest:
+        entry = _entry(
+            number, open_["what"], _counted(before, state), before, state, command=open_["command"], when=open_["when"],
+            interrupted=interrupted,
+        )  # fmt: skip
+        shards.write_atomic(entry_path(root, number), entry.to_json())
     _open_path(root).unlink()
 
 
-def _last(root: Path) -> HistoryEntry | None:
-    there = numbers(root)
-    return read_entry(root, there[-1]) if there else None
+def _last(root: Path) -> tuple[int, DatasetState]:
+    """Number of the last operation, 0 for none, and the state after it; of one that cannot be read, the empty state."""
+    number = max(numbers(root), default=0)
+    with contextlib.suppress(StoreError):
+        return number, state_after(root, number)
+    return number, DatasetState()
 
 
 def _entry(
     number: int, what: str, note: str, before: DatasetState, after: DatasetState, *, undoes: int | None = None,
-    command: str | None = None, when: str | None = None, interrupted: bool = False, before_digest: str | None = None,
+    command: str | None = None, when: str | None = None, interrupted: bool = False,
 ) -> HistoryEntry:  # fmt: skip
     return HistoryEntry(
-        number, what, command_line() if command is None else command, when or _now(), note, before_digest or before.digest,
-        after.digest, len(after.episodes), after.n_steps, undoes, interrupted, after,
+        number, what, command_line() if command is None else command, when or _now(), note, before.digest, after.digest,
+        len(after.episodes), after.n_steps, undoes, interrupted, after, touched(before, after),
     )  # fmt: skip
+
+
+def touched(before: DatasetState, after: DatasetState) -> Touched:
+    """The files in which two states differ."""
+    one, other = before.checksums(), after.checksums()
+    pairs = {name: (one.get(name, ""), other.get(name, "")) for name in sorted(one.keys() | other.keys())}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 def _counted(before: DatasetState, after: DatasetState) -> str:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+from vilp_data.dataset_state import dumps
 from vilp_data.episode_entry import EpisodeEntry
 from vilp_data.errors import StoreError
-from vilp_data.surgery.dataset_state import dumps
 
 REMOVED_FORMAT = 1
 
 
 @dataclass(frozen=True)
 class RemovedEpisode:
-    """What is still known of an episode that was removed: where it came from, its content, why and by which operation it went."""
+    """What is still known of an episode that was removed: where it came from, its content, why and by which operation it went.
+
+    edits  what people had decided about it, as `EpisodeEntry.edits`: kept, should it be wanted again
+    cut    its range of the log, as `EpisodeEntry.cut`
+    tick_ns  the time of its first step (of the first that a trim had left); None in files of an older version"""
 
     source: str
     source_sha256: str
@@ -25,6 +30,9 @@ class RemovedEpisode:
     ingest_content: str
     reason: str
     operation: int
+    edits: Mapping[str, Any] = field(default_factory=dict)
+    cut: Mapping[str, Any] = field(default_factory=dict)
+    tick_ns: int | None = None
 
 
 Removed = Mapping[str, RemovedEpisode]
@@ -55,7 +63,7 @@ def removed_bytes(removed: Removed) -> bytes:
     return dumps({"format": REMOVED_FORMAT, "episodes": {id: asdict(episode) for id, episode in removed.items()}})
 
 
-def removed_episode(entry: EpisodeEntry, *, reason: str, operation: int) -> RemovedEpisode:
+def removed_episode(entry: EpisodeEntry, *, tick_ns: int, reason: str, operation: int) -> RemovedEpisode:
     return RemovedEpisode(
         entry.source,
         entry.source_sha256,
@@ -64,4 +72,7 @@ def removed_episode(entry: EpisodeEntry, *, reason: str, operation: int) -> Remo
         entry.ingest_content,
         reason,
         operation,
+        dict(entry.edits),
+        dict(entry.cut),
+        tick_ns,
     )
