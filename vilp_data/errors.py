@@ -73,6 +73,10 @@ class SplitError(VilpDataError):
     """A split that cannot be drawn, or that does not fit the episodes at hand."""
 
 
+class ActionSetError(VilpDataError):
+    """An action set that cannot be chosen, or that does not fit the dataset at hand."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """A remedy that names the nearest known name: `did you mean 'rate_hz'? known: ...`."""
     names = sorted(known)

@@ -14,7 +14,7 @@ holds many. The same bytes are the same episode, whatever the log is called now.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -116,7 +116,8 @@ def make_plan(
 
 
 def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, plan: Plan) -> list[Source]:
-    """Every demonstration of the logs, those with the same bytes once; logs that cannot be read go to `plan.failed`."""
+    """Every demonstration of the logs, with the tags that the task gives it, those with the same bytes once; logs that cannot be read
+    go to `plan.failed`."""
     sources: dict[str, Source] = {}
     for path in logs:
         try:
@@ -136,7 +137,8 @@ def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, plan: P
             sha256 = hashes[cuts.native[demonstration.name]]
             if is_cut:  # known by its own range of the log's bytes
                 sha256 = digest({"log": sha256, "start_ns": demonstration.start_ns, "end_ns": demonstration.end_ns})
-            source = Source(path, demonstration, sha256, alone=len(natives) == 1 and not is_cut)
+            tags = {**spec.tags_of(path.name), **demonstration.tags}
+            source = Source(path, replace(demonstration, tags=tags), sha256, alone=len(natives) == 1 and not is_cut)
             first = sources.setdefault(sha256, source)
             if first is not source:
                 copied = "" if first.alone else f", {first.demonstration.name}"
