@@ -1,8 +1,10 @@
 # make latents TASK=hanoi        episode logs -> cached VQGAN latents, everything before it included
 # make rollout TASK=pusht LOGS=… … -> planner and low-level policy -> VILP in the simulator, everything before it included
+# make policy TASK=pusht SET=small … the low-level policy (bc, rollout too) learns from an action set's episodes alone
 # make test                      lint, types, import rules, tests
 #
-# TASK    a task in pipelines/: hanoi, pusht      PRESET  tiny | cpu | paper
+# TASK    a task in pipelines/: arrange_blocks, hanoi, pusht      PRESET  tiny | cpu | paper
+# SET     an action set: small, hybrid, off_target, or a recipe TOML; without, all training episodes with actions give labels
 # LOGS    your own logs (files or folders) instead of recorded ones
 # SEEDS   which starts a rollout has, FIRST:END   TORCH   what pip installs as torch
 # DATA    the dataset folder
@@ -10,6 +12,7 @@
 TASK   ?= hanoi
 PRESET ?= cpu
 LOGS   ?=
+SET    ?=
 DATA   ?= data/$(TASK)$(if $(filter tiny,$(PRESET)),-tiny)
 TORCH  ?= torch==2.13.0
 PYTHON ?= python3
@@ -20,15 +23,16 @@ RUN   := $(DATA)/runs/vqgan-$(PRESET)
 MODEL := --data $(DATA) --task $(TASK) --preset $(PRESET)
 SEEDS ?= $(if $(filter tiny,$(PRESET)),0:2,0:50)
 LOGS_IN := $(if $(LOGS),$(LOGS),$(DATA)/logs)
+LABELS := $(if $(SET),--set $(basename $(notdir $(SET))))
 SECONDS ?= 120
 SUDO  := $(if $(filter 0,$(shell id -u)),,$(shell command -v sudo >/dev/null && echo sudo -n))
 
 export MUJOCO_GL ?= osmesa
 
-.PHONY: setup record ingest split vqgan latents planner policy bc generate rollout view replay test test-slow fuzz lint bench docs clean help
+.PHONY: setup record ingest split vqgan latents actions planner policy bc generate rollout view replay test test-slow fuzz lint bench docs clean help
 
 help:
-	@sed -n '1,9p' Makefile
+	@sed -n '1,11p' Makefile
 
 # --- set-up ----------------------------------------------------------------------------------------------------------
 
@@ -60,19 +64,23 @@ planner: latents
 	@$(BIN)/vilp-models train planner $(MODEL)
 	@$(BIN)/vilp-models evaluate planner $(MODEL) $(if $(filter tiny,$(PRESET)),--starts 4 --samples 2) || [ $$? -eq 1 ]
 
-policy: latents
-	@$(BIN)/vilp-models train policy $(MODEL)
-	@$(BIN)/vilp-models evaluate policy $(MODEL) || [ $$? -eq 1 ]
+# which episodes give action labels; what is locked stays
+actions: split
+	@$(if $(SET),$(BIN)/vilp-data actions --recipe $(SET) --preset $(PRESET) --data $(DATA),echo "actions: SET=small, hybrid, off_target or a recipe TOML"; exit 2)
 
-bc: split
-	@$(BIN)/vilp-models train bc $(MODEL)
+policy: latents $(if $(SET),actions)
+	@$(BIN)/vilp-models train policy $(MODEL) $(LABELS)
+	@$(BIN)/vilp-models evaluate policy $(MODEL) $(LABELS) || [ $$? -eq 1 ]
+
+bc: split $(if $(SET),actions)
+	@$(BIN)/vilp-models train bc $(MODEL) $(LABELS)
 
 generate: planner
 	@$(BIN)/vilp-models generate $(MODEL)
 
 rollout: planner policy
 	@$(BIN)/vilp-models rollout $(MODEL) --policy stay --seeds $(SEEDS)
-	@$(BIN)/vilp-models rollout $(MODEL) --policy vilp --seeds $(SEEDS)
+	@$(BIN)/vilp-models rollout $(MODEL) $(LABELS) --policy vilp --seeds $(SEEDS)
 
 # the newest log there is, of a policy or of the recorder; without any, the first ingested episode
 view: $(READY)

@@ -98,6 +98,19 @@ def test_make_rollout_trains_every_model_and_lets_them_act(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.sim
+@pytest.mark.parametrize("task", ["arrange_blocks", "pusht"])
+def test_tasks_with_variants_go_from_nothing_to_a_policy_that_acts(tmp_path: Path, task: str) -> None:
+    pytest.importorskip("gym_pusht", reason="the simulators are not installed: make setup")
+    words = [f"TASK={task}", "PRESET=tiny", "SEEDS=0:1", f"DATA={tmp_path}"]
+    told = make("rollout", *words)
+    assert "6 logs, 6 successful" in told
+    assert "6 episodes ingested" in told
+    assert (tmp_path / "rollouts" / "vilp-tiny-0-1" / "report.json").is_file()
+    assert "NOT within" not in make("replay", *words)
+
+
+@pytest.mark.slow
 def test_human_push_t_goes_through_the_same_line(tmp_path: Path) -> None:
     log = real_data("pusht/pusht_cchi_v7_replay.zarr")
     out = make("latents", "TASK=pusht", "PRESET=tiny", f"LOGS={log}", f"DATA={tmp_path}")

@@ -32,6 +32,9 @@ def test_every_built_in_task_is_valid_under_every_preset(task: str, preset: str 
         ("[action.a]\ntopic = '/c'\nkind = 'delta_rotation'", "composes differently"),
         ("[low_dim.a]\ntopic = '/a'\nclock = 'log'", "read by two clocks"),
         ("[presets.cppu]", "did you mean 'cpu'"),
+        ("[record.variants.purple]\nepisodes = 3\noptoins = {}", "did you mean 'options'"),
+        ("[record.variants.purple]\nepisodes = 3", "record.variants.purple.options"),
+        ("[record.variants.'a/b']\nepisodes = 3\noptions = {}", "part of a file's name"),
         ("name = 3 = 4", "not valid TOML"),
     ],
 )
@@ -56,6 +59,18 @@ def test_a_preset_overrides_table_by_table(tmp_path: Path) -> None:
     assert load_task(str(path)).record.episodes == 20
     tiny = load_task(str(path), preset="tiny").record
     assert (tiny.episodes, tiny.first_seed) == (2, 3)
+
+
+def test_a_variant_changes_options_of_the_simulator_and_keeps_the_others() -> None:
+    text = '[sim]\nenv = "e"\nmax_steps = 7\noptions = { colour = "gray", size = 3 }\n'
+    variant = '[record.variants.off_target]\nepisodes = 2\nfirst_seed = 9\noptions = { colour = "purple" }\n'
+    spec = parse_task(GOOD + text + variant, where="task.toml")
+    sim = spec.simulated_as("off_target")
+    assert (sim.env, sim.max_steps, sim.options) == ("e", 7, {"colour": "purple", "size": 3})
+    assert spec.sim is not None
+    assert spec.sim.options == {"colour": "gray", "size": 3}
+    with pytest.raises(SpecError, match="did you mean 'off_target'"):
+        spec.simulated_as("of_target")
 
 
 def test_the_order_of_an_action_s_parts_is_part_of_the_ingest_fields() -> None:

@@ -18,8 +18,9 @@ from torch.utils.data import Dataset
 from vilp_data import windows
 from vilp_data.batches import TensorBatch, allocated
 from vilp_data.dataset_split import side_episodes
-from vilp_data.episodes import EpisodeStore
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import NoWindowError
+from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.open_episodes import OpenEpisodes, valid_runs
 from vilp_data.spec import WindowSpec
 from vilp_data.types import I64
@@ -68,16 +69,18 @@ class WindowDataset(Dataset[WindowTensors]):
         with_frames: bool = True,
         with_actions: bool = True,
         acting: bool = False,
+        labels: LabelledEpisodes | None = None,
     ) -> None:
         """Open the dataset at `root`. `latent_keys` names the encoder key of each view whose latents are read, `views` those
-        whose images are: the same ones for None. `acting` leaves out the episodes without actions.
+        whose images are: the same ones for None. `acting` leaves out the episodes without actions. `labels` are as of
+        `pairs.PairDataset`.
 
         Raises SplitError without a split that covers the episodes, and NoWindowError where no window fits. What else is refused,
         and when, `open_episodes.OpenEpisodes` says.
         """
         store = EpisodeStore(Path(root))
         self._window = window
-        entries = store.index() if split == "all" else side_episodes(store, split)
+        entries = _side(store, split) if labels is None else labels.of_side(split)
         self._entries = [entry for entry in entries if entry.has_action or not acting]
         self._n_steps = np.array([entry.n_steps for entry in self._entries], np.int64)
         self._has_action = np.array([entry.has_action and with_actions for entry in self._entries], np.bool_)
@@ -88,6 +91,7 @@ class WindowDataset(Dataset[WindowTensors]):
             latent_keys=latent_keys,
             frame_views=frame_views if with_frames else (),
             has_action=self._has_action,
+            labels=labels,
         )
         episode, runs = valid_runs(store, self._entries)
         starts = windows.plan_windows(
@@ -97,6 +101,8 @@ class WindowDataset(Dataset[WindowTensors]):
             frame_stride=window.frame_stride,
             max_goal_frames=window.max_goal_frames,
         )
+        if labels is not None:
+            episode, starts = windows.repeated(episode, starts, labels.repeats())
         self._index = windows.WindowIndex.of(episode, starts)
         if not len(self._index):
             raise NoWindowError(
@@ -110,6 +116,11 @@ class WindowDataset(Dataset[WindowTensors]):
     def episode_ids(self) -> list[str]:
         """What `WindowTensors.episode` counts through."""
         return [entry.id for entry in self._entries]
+
+    @property
+    def samples_per_episode(self) -> I64:
+        """int64 [E]: how many numbers each of `episode_ids` has."""
+        return self._index.per_episode(len(self._entries))
 
     def __len__(self) -> int:
         return len(self._index)
@@ -193,3 +204,7 @@ class WindowDataset(Dataset[WindowTensors]):
             episode=tensors["episode"],
             step=tensors["step"],
         )
+
+
+def _side(store: EpisodeStore, split: Literal["train", "val", "all"]) -> list[EpisodeEntry]:
+    return store.index() if split == "all" else side_episodes(store, split)

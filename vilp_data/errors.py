@@ -75,6 +75,10 @@ class SplitError(VilpDataError):
     """A split that cannot be drawn, or that does not fit the episodes at hand."""
 
 
+class ActionSetError(VilpDataError):
+    """An action set that cannot be chosen, or that does not fit the dataset at hand."""
+
+
 def salvage_command(log: Path) -> str:
     """The whole command that gets back what a damaged log still holds, in backticks."""
     clean = log.with_name(f"{Path(log.name.removesuffix('.active')).stem}-salvaged.mcap")

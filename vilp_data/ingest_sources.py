@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -81,19 +81,21 @@ def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, known: 
 def _read_log(
     log: IndexedLog, path: Path, spec: TaskSpec, cache: HashCache, known: Sequence[KnownCut]
 ) -> tuple[list[Source], list[KnownCut], list[str]]:
-    """The log's demonstrations, the known cuts that it holds, and sentences."""
+    """The log's demonstrations, with the tags that the task gives them, the known cuts that it holds, and sentences."""
     natives, remember = log.episodes(), partial(cache.remembered, path)
     hashes = cache.of_log(log, path, natives)
     if not natives:
         raise LogError("the log holds no message", where=path, remedy="leave it out")
     cuts = cut_log(log, spec, path, remember)
     notes = [*cuts.notes, *(f"{path}: {doubt}" for doubt in log.doubts())]
+    told = spec.tags_of(path.name)
+    demonstrations = [replace(one, tags={**told, **one.tags}) for one in cuts.demonstrations]
     if spec.episodes.kind == "file":
         alone = len(natives) == 1
-        return [Source(path, one, hashes[one.name], alone) for one in cuts.demonstrations], [], notes
+        return [Source(path, one, hashes[one.name], alone) for one in demonstrations], [], notes
     topics = tuple(sorted({topic.name for topic in log.topics()}.intersection(spec.topics())))
     found = []
-    for one in cuts.demonstrations:
+    for one in demonstrations:
         cut = Cut(one.start_ns, one.end_ns, topics)
         sha256 = cut_sha256(log, cut, hashes[cuts.native[one.name]], remember)
         found.append(Source(path, one, sha256, alone=False, cut=cut))

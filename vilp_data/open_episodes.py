@@ -19,6 +19,7 @@ from vilp_data import shards, windows
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import StoreError, UsageError, nearest
+from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.latents import latents_path, open_latents
 from vilp_data.types import F16, F32, I64, U8, Bool
 
@@ -68,15 +69,17 @@ class OpenEpisodes:
         latent_keys: Mapping[str, str],
         frame_views: Iterable[str],
         has_action: Bool,
+        labels: LabelledEpisodes | None = None,
     ) -> None:
         """`latent_keys` names the encoder key of each view whose latents are read, `frame_views` the views whose images are,
-        and `has_action` [E] says whose actions are.
+        and `has_action` [E] says whose actions are. With `labels` steps are opened through them alone, which refuse episodes that are
+        not of their action set.
 
         Raises UsageError for a view that does not exist, and StoreError where latents are missing. Files that do not belong
         together (latents or frames of another ingest, arrays of other lengths) are a StoreError when an episode is first
         needed, by what their headers say; bytes that changed on disk are found by whole reads alone (see `episode_files`).
         """
-        self._store, self._entries = store, entries
+        self._store, self._entries, self._labels = store, entries, labels
         self._latent_keys, self._frame_views = dict(latent_keys), tuple(frame_views)
         self._has_action = has_action
         for view in (*self._latent_keys, *self._frame_views):
@@ -102,7 +105,8 @@ class OpenEpisodes:
     def _open_episode(self, number: int) -> OpenEpisode:
         entry, store = self._entries[number], self._store
         views = dict.fromkeys((*self._latent_keys, *self._frame_views))
-        steps = open_steps(store, entry, views)
+        labels = self._labels
+        steps = open_steps(store, entry, views) if labels is None else labels.open_steps(entry, views)
         opened = OpenEpisode(
             source_index={view: steps[f"source_index/{view}"] for view in views},
             latents={view: open_latents(store.root, entry, view, key) for view, key in self._latent_keys.items()},

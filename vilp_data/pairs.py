@@ -18,8 +18,9 @@ from torch.utils.data import Dataset
 from vilp_data import windows
 from vilp_data.batches import TensorBatch, allocated
 from vilp_data.dataset_split import side_episodes
-from vilp_data.episodes import EpisodeStore
+from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import StoreError
+from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.open_episodes import OpenEpisodes, valid_runs
 from vilp_data.types import I64
 
@@ -57,23 +58,19 @@ class PairDataset(Dataset[PairTensors]):
         latent_keys: Mapping[str, str] | None = None,
         views: Sequence[str] | None = None,
         with_frames: bool = True,
+        labels: LabelledEpisodes | None = None,
+        where: Mapping[str, str] | None = None,
     ) -> None:
         """Open the dataset at `root`. `views` are those whose images are read, all of them for None; `latent_keys` names the
-        encoder key of each view whose latents are read too, none for None.
+        encoder key of each view whose latents are read too, none for None. `labels` leaves an action set's episodes alone of the
+        training side, and gives each of their pairs as many numbers as an epoch of the set goes over it. `where` leaves the
+        episodes of a side that have these tags.
 
         Raises SplitError without a split that covers the episodes, and StoreError where no episode has actions or no pair
         fits. What else is refused, and when, `open_episodes.OpenEpisodes` says.
         """
         store = EpisodeStore(Path(root))
-        entries = store.index() if split == "all" else side_episodes(store, split)
-        self._entries = [entry for entry in entries if entry.has_action]
-        if not self._entries:
-            raise StoreError(
-                "no episode has actions",
-                where=store.root,
-                found=f"none among {len(entries)}" + ("" if split == "all" else f" on the {split} side of the split"),
-                remedy="ingest logs that hold the topics of the task's [action], or draw the split again with `--redraw`",
-            )
+        self._entries = _acting(store, split, where or {}) if labels is None else labels.of_side(split)
         self._frame_stride = frame_stride
         every_view = sorted(self._entries[0].frames_sha256) if views is None else views
         self._episodes = OpenEpisodes(
@@ -82,9 +79,13 @@ class PairDataset(Dataset[PairTensors]):
             latent_keys=latent_keys or {},
             frame_views=every_view if with_frames else (),
             has_action=np.ones(len(self._entries), np.bool_),
+            labels=labels,
         )
         episode, runs = valid_runs(store, self._entries)
-        self._index = windows.WindowIndex.of(episode, windows.pair_windows(runs, frame_stride=frame_stride))
+        starts = windows.pair_windows(runs, frame_stride=frame_stride)
+        if labels is not None:
+            episode, starts = windows.repeated(episode, starts, labels.repeats())
+        self._index = windows.WindowIndex.of(episode, starts)
         if not len(self._index):
             longest = max(entry.n_steps for entry in self._entries)
             raise StoreError(
@@ -98,6 +99,11 @@ class PairDataset(Dataset[PairTensors]):
     def episode_ids(self) -> list[str]:
         """What `PairTensors.episode` counts through: the episodes with actions."""
         return [entry.id for entry in self._entries]
+
+    @property
+    def samples_per_episode(self) -> I64:
+        """int64 [E]: how many numbers each of `episode_ids` has."""
+        return self._index.per_episode(len(self._entries))
 
     def __len__(self) -> int:
         return len(self._index)
@@ -151,3 +157,17 @@ class PairDataset(Dataset[PairTensors]):
             episode=tensors["episode"],
             step=tensors["step"],
         )
+
+
+def _acting(store: EpisodeStore, split: Literal["train", "val", "all"], where: Mapping[str, str]) -> list[EpisodeEntry]:
+    entries = store.index() if split == "all" else side_episodes(store, split)
+    acting = [entry for entry in entries if entry.has_action and where.items() <= entry.tags.items()]
+    if not acting:
+        among = f"none among {len(entries)}" + ("" if split == "all" else f" on the {split} side of the split")
+        raise StoreError(
+            "no episode has actions" + "".join(f", and {tag} = {value}" for tag, value in where.items()),
+            where=store.root,
+            found=among,
+            remedy="ingest logs that hold the topics of the task's [action], or draw the split again with `--redraw`",
+        )
+    return acting

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from fnmatch import fnmatchcase
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -208,11 +209,33 @@ class SimSpec(Frozen):
     max_steps: int = Field(default=300, gt=0)
 
 
+class VariantSpec(Frozen):
+    """Episodes of the same simulator with other options (those of `[sim]` stay where these say nothing), in logs with a name and a tag of
+    their own: demonstrations off target."""
+
+    episodes: int = Field(gt=0)
+    first_seed: int = Field(default=0, ge=0)
+    options: dict[str, Any]
+
+
 class RecordSpec(Frozen):
-    """How many episodes `record` makes, from which seed on."""
+    """How many episodes `record` makes, from which seed on; and of which variants of the task, by name."""
 
     episodes: int = Field(default=24, gt=0)
     first_seed: int = Field(default=0, ge=0)
+    variants: dict[str, VariantSpec] = {}
+
+    @model_serializer(mode="wrap")
+    def _with_variants_if_stated(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without variants where none are stated, as before there were any."""
+        return {name: value for name, value in plain(self).items() if name != "variants" or value}
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> Self:
+        for name in self.variants:
+            if not name.replace("_", "").isalnum():
+                raise ValueError(f"variant {name!r} becomes part of a file's name: letters, digits and _ only")
+        return self
 
 
 class TaskSpec(Frozen):
@@ -220,6 +243,7 @@ class TaskSpec(Frozen):
 
     rate_hz None means the rate of the slowest camera. A task without views is of logs without cameras: it can be ingested, looked at,
     checked and exported, and only behaviour cloning trains on it. `models` holds the tables of vilp_models, which validates them.
+    `tags` are of demonstrations in logs that do not say what they show: file name, or a pattern of it ("*.zarr") -> tag -> value.
     """
 
     name: str
@@ -234,6 +258,12 @@ class TaskSpec(Frozen):
     sim: SimSpec | None = None
     record: RecordSpec = RecordSpec()
     models: dict[str, dict[str, Any]] = {}
+    tags: dict[str, dict[str, str]] = {}
+
+    @model_serializer(mode="wrap")
+    def _with_tags_if_stated(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without tags where none are stated, as before there were any."""
+        return {name: value for name, value in plain(self).items() if name != "tags" or value}
 
     @model_validator(mode="after")
     def _names_fit(self) -> Self:
@@ -297,6 +327,19 @@ class TaskSpec(Frozen):
         ]
         return [spec for spec in specs if spec.topic is not None]
 
+    def simulated_as(self, name: str) -> SimSpec:
+        """The simulator of one of the task's [record.variants]: with the variant's options. SpecError for a name it does not have."""
+        if self.sim is None or name not in self.record.variants:
+            known = nearest(name, self.record.variants) if self.record.variants else "it has none"
+            raise SpecError(f"the task has no variant {name!r}", where=self.name, remedy=known)
+        options = {**self.sim.options, **self.record.variants[name].options}
+        return self.sim.model_copy(update={"options": options})
+
+    def tags_of(self, log: str) -> dict[str, str]:
+        """The tags that the task gives the demonstrations in a log of this file name."""
+        matching = [tags for pattern, tags in self.tags.items() if fnmatchcase(log, pattern)]
+        return {tag: value for tags in matching for tag, value in tags.items()}
+
     def ingest_fields(self) -> dict[str, Any]:
         """What decides the bytes of an ingested episode, as plain data: part of every episode's key.
 
@@ -358,15 +401,20 @@ def parse_task(text: str, *, where: str, preset: str | None = None) -> TaskSpec:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SpecError("not valid TOML", where=where, found=str(error), remedy="correct that line") from error
+    return _validated(with_preset(table, preset, where=where), where)
+
+
+def with_preset(table: dict[str, Any], preset: str | None, *, where: str) -> dict[str, Any]:
+    """A TOML without its `[presets]`, those of `preset` in place of what they override. SpecError for a name that is none."""
     presets = table.pop("presets", {})
     for name in presets:
         if name not in PRESETS:
             raise SpecError(f"unknown preset [presets.{name}]", where=where, remedy=nearest(name, PRESETS))
-    if preset is not None:
-        if preset not in PRESETS:
-            raise SpecError(f"unknown preset {preset!r}", where=where, remedy=nearest(preset, PRESETS))
-        table = _merged(table, presets.get(preset, {}))
-    return _validated(table, where)
+    if preset is None:
+        return table
+    if preset not in PRESETS:
+        raise SpecError(f"unknown preset {preset!r}", where=where, remedy=nearest(preset, PRESETS))
+    return _merged(table, presets.get(preset, {}))
 
 
 def task_from_dict(table: dict[str, Any], *, where: str) -> TaskSpec:
@@ -416,4 +464,6 @@ def _known_keys(location: tuple[int | str, ...]) -> list[str]:
     table = tables.get(str(location[0]), TaskSpec) if len(location) > 1 else TaskSpec
     if table is ViewSpec and location[2:3] == ("depth",) and len(location) > 3:
         table = DepthSpec
+    if table is RecordSpec and location[1:2] == ("variants",) and len(location) > 3:
+        table = VariantSpec
     return sorted(info.alias or name for name, info in table.model_fields.items())

@@ -63,9 +63,15 @@ def pair_steps(start: I64, *, frame_stride: int) -> tuple[I64, I64]:
     return start + frame_stride, start[:, None] + np.arange(frame_stride)
 
 
+def repeated(episode: I64, starts: I64, times: I64) -> tuple[I64, I64]:
+    """Ranges of first steps int64 [R,2] and the episode [R] of each, those of episode e `times[e]` times one after another."""
+    count = times[episode]
+    return np.repeat(episode, count), np.repeat(starts, count, axis=0)
+
+
 @dataclass(frozen=True)
 class WindowIndex:
-    """Windows of many episodes under consecutive numbers, ordered by episode and step.
+    """Windows of many episodes under consecutive numbers, ordered by episode and step. A window may have several numbers.
 
     episode, first  int64 [R]: the episode of each run of windows, and the step where its first window begins
     end             int64 [R]: number of windows up to and including each run
@@ -82,6 +88,11 @@ class WindowIndex:
 
     def __len__(self) -> int:
         return int(self.end[-1]) if len(self.end) else 0
+
+    def per_episode(self, n_episodes: int) -> I64:
+        """int64 [E]: how many numbers each episode has."""
+        sizes = np.diff(self.end, prepend=0)
+        return np.bincount(self.episode, sizes, n_episodes).astype(np.int64)
 
     def locate(self, number: I64) -> tuple[I64, I64]:
         """Episode and first step, int64 [B] each, of windows `number` int64 [B]. IndexError outside 0 … len - 1."""

@@ -42,6 +42,7 @@ class RunState:
     model           kind of model: "vqgan", "planner", "policy", "bc"
     contract        `DataContract.to_json` of the dataset it learns from; None for a VQGAN, which depends on frames alone
     built_by        what decides the network besides recipe and contract: {"n_action_steps": …} for "bc", else nothing
+    action_set      {"name", "key"} of the action set whose episodes train_episodes are; None where it learns from all there are
     """
 
     step: int
@@ -52,6 +53,14 @@ class RunState:
     model: str = "vqgan"  # checkpoints of before there were others name none
     contract: Mapping[str, Any] | None = None
     built_by: Mapping[str, int] = field(default_factory=dict)
+    action_set: Mapping[str, str] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data. Without an action set it says nothing of one, as before there were any."""
+        table = asdict(self)
+        if self.action_set is None:
+            del table["action_set"]
+        return table
 
     @property
     def finished(self) -> bool:
@@ -96,7 +105,7 @@ def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
     write_atomic(run / "recipe.json", (recipe + "\n").encode())
     tensors = {f"model/{name}": array for name, array in checkpoint.model.items()}
     tensors |= {f"trainer/{name}": array for name, array in checkpoint.trainer.items()}
-    header = {"format": FORMAT, "recipe": recipe, "state": json.dumps(asdict(checkpoint.state), sort_keys=True)}
+    header = {"format": FORMAT, "recipe": recipe, "state": json.dumps(checkpoint.state.to_json(), sort_keys=True)}
     write_shard(run / FILE, tensors, header)
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import StoreError, UsageError
+from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.latent_runs import stats_path
 from vilp_data.latents import latents_path, open_latents
 from vilp_data.shards import read_header
@@ -82,14 +83,16 @@ class DataContract:
         plans: bool = True,
         low_dim: bool = True,
         action: bool = True,
+        labels: LabelledEpisodes | None = None,
     ) -> Self:
         """Of the dataset at `root` as it is now; statistics over the episodes `train` alone, which must not be empty.
 
         `spec` is the dataset's; `window` outranks its own. `latent_keys` names the encoder of each view whose latents are
         used. `plans` False is a model without planned frames, for which n_plan_frames and max_goal_frames decide nothing;
         without `low_dim` or `action` the model never sees them. Low_dim counts valid steps alone, actions those of episodes
-        that have them. Raises UsageError without training episodes, or without actions where they are wanted; StoreError for
-        latents that are missing or stale."""
+        that have them. With `labels` of an action set, whose episodes `train` must be, statistics of actions are those that were
+        locked with the set, and steps are read through it alone. Raises UsageError without training episodes, or without actions
+        where they are wanted; StoreError for latents that are missing or stale."""
         if not train:
             raise UsageError(
                 "there is no training episode", where=root, remedy="ingest more, or change the split's ratio"
@@ -105,8 +108,10 @@ class DataContract:
             for view, key in sorted((latent_keys or {}).items())
         }
         if low_dim and spec.low_dim:
-            normaliser["low_dim"] = moments(ChannelStats.over(_valid_steps(store, train, "low_dim")))
-        if action:
+            normaliser["low_dim"] = moments(ChannelStats.over(_valid_steps(store, train, "low_dim", labels)))
+        if action and labels is not None:
+            normaliser["action"] = moments(labels.action)
+        elif action:
             normaliser["action"] = moments(ChannelStats.over(_valid_steps(store, acting, "action")))
         return cls(
             **_of_views(spec),
@@ -142,10 +147,17 @@ class DataContract:
         )
 
     def now(
-        self, root: Path, spec: TaskSpec, train: Sequence[EpisodeEntry], *, latent_keys: Mapping[str, str] | None = None
+        self,
+        root: Path,
+        spec: TaskSpec,
+        train: Sequence[EpisodeEntry],
+        *,
+        latent_keys: Mapping[str, str] | None = None,
+        labels: LabelledEpisodes | None = None,
     ) -> DataContract:
         """The same of the dataset as it is now, to compare: statistics over `train`, which should be the entries of those
-        episodes that the run was trained on. `latent_keys` are those of today's encoder; None means this contract's."""
+        episodes that the run was trained on. `latent_keys` are those of today's encoder; None means this contract's. `labels` as of
+        `of`."""
         return DataContract.of(
             root,
             spec,
@@ -154,6 +166,7 @@ class DataContract:
             plans=self.n_plan_frames > 0,
             low_dim=self.low_dim_size > 0,
             action=self.action_size > 0,
+            labels=labels,
         )
 
     def image_channels(self, view: str) -> int:
@@ -326,9 +339,11 @@ def _latent_shape(root: Path, view: str, key: str, entry: EpisodeEntry) -> tuple
     return c, h, w
 
 
-def _valid_steps(store: EpisodeStore, entries: Sequence[EpisodeEntry], name: str) -> Iterator[npt.NDArray[Any]]:
+def _valid_steps(
+    store: EpisodeStore, entries: Sequence[EpisodeEntry], name: str, labels: LabelledEpisodes | None = None
+) -> Iterator[npt.NDArray[Any]]:
     for entry in entries:
-        arrays = open_steps(store, entry)
+        arrays = open_steps(store, entry) if labels is None else labels.open_steps(entry)
         yield arrays[name][arrays["valid"]]
 
 

@@ -5,7 +5,7 @@ Reports go into the run's folder evaluation/, and are made once for the same inp
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from vilp_models.imagined import Imagination
 from vilp_models.planner_page import write_planner_report
 from vilp_models.policy_page import write_policy_report
 from vilp_models.report_files import read_fresh_report, shown
+from vilp_models.runs import tags_name
 from vilp_models.trained import TrainedPlanners, default_device, load_encoders, load_low_level, load_planners
 
 FOLDER = "evaluation"
@@ -99,20 +100,29 @@ def evaluate_planner(
 
 
 def evaluate_policy(
-    root: Path, spec: TaskSpec, run_dir: Path, vqgan: Path, *, progress: Progress | None = None
+    root: Path,
+    spec: TaskSpec,
+    run_dir: Path,
+    vqgan: Path,
+    *,
+    action_set: str | None = None,
+    where: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[dict[str, Any], Path]:
-    """The report of the low-level policy in `run_dir` as plain data, and its folder. Raises what `load_encoders`, `load_low_level`
+    """The report of the low-level policy in `run_dir` as plain data, and its folder: on validation episodes, on those with the tags
+    `where` alone if any are named. Raises what `load_encoders`, `load_low_level`
     and `PairDataset` raise."""
     store, device = EpisodeStore(root), default_device()
     encoders = load_encoders(store, spec, vqgan, device=device)
-    trained = load_low_level(store, spec, run_dir, encoders, device=device)
+    trained = load_low_level(store, spec, run_dir, encoders, action_set=action_set, device=device)
     inputs = {
         "format": policy_report.REPORT_FORMAT,
         "policy": trained.digest,
         "holds": {part: action.holds for part, action in spec.action.items()},
         **_judged_on(store, vqgan),
+        **({"where": dict(where)} if where else {}),
     }
-    folder = run_dir / FOLDER
+    folder = run_dir / "-".join([FOLDER, *tags_name(where or {})])
 
     def make() -> None:
         pairs = PairDataset(
@@ -121,6 +131,7 @@ def evaluate_policy(
             frame_stride=trained.contract.frame_stride,
             latent_keys={view: encoder.key for view, encoder in encoders.items()},
             with_frames=trained.recipe.sees == "frames",
+            where=where,
         )
         report = policy_report.policy_report(
             store,

@@ -9,6 +9,7 @@ An environment is what `make_env` makes, and keeps to a small contract:
 - every info holds "state", float64 [S], laid out like the episode's;
 - for a policy to act in it (`rollout`), every info also holds "is_success" and "hold_action", float32 [A]: the action that
   keeps the robot where it is;
+- `tags()`, where it has them, says what tells its world from others of the task ("goal", "object"), as its logs are tagged;
 - its metadata may say `state_names`, `state_periods` (inf where a value does not wrap around), `controlled_state` (the
   indices that the actions command; others also depend on contacts, and on what a state leaves out) and
   `replay_tolerance`, in their unit.
@@ -16,6 +17,7 @@ An environment is what `make_env` makes, and keeps to a small contract:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from vilp_data.errors import UsageError
@@ -53,3 +55,48 @@ def make_env(spec: TaskSpec, *, cameras: bool = True) -> Any:
     except gymnasium.error.UnregisteredEnv as error:
         remedy = "correct sim.env in its TOML"
         raise UsageError(f"no simulator called {sim.env!r}", where=spec.name, found=error, remedy=remedy) from error
+
+
+WORLD_TAGS = ("goal", "object")
+"""An episode that says another of these than an environment does was not recorded in its like."""
+
+
+def world_tags(env: Any) -> dict[str, str]:
+    """Those of `WORLD_TAGS` that the environment says of itself."""
+    tags: Mapping[str, str] = getattr(env.unwrapped, "tags", dict)()
+    return {tag: tags[tag] for tag in WORLD_TAGS if tag in tags}
+
+
+def is_of_world(tags: Mapping[str, str], world: Mapping[str, str]) -> bool:
+    """Whether an episode of these tags may be of that world: no tag of it says otherwise."""
+    return all(tags.get(tag, value) == value for tag, value in world.items())
+
+
+class Worlds:
+    """The task's own environment and those of its variants ([record.variants]), made when they are needed."""
+
+    def __init__(self, spec: TaskSpec, *, cameras: bool) -> None:
+        self._spec, self._cameras = spec, cameras
+        self._made: dict[str | None, Any] = {}
+
+    def of(self, tags: Mapping[str, str]) -> Any:
+        """The environment that an episode of these tags was recorded in; the task's own where no variant says it is that one."""
+        for variant in (None, *self._spec.record.variants):
+            env = self._env(variant)
+            if is_of_world(tags, world_tags(env)):
+                return env
+        return self._env(None)
+
+    def own_tags(self) -> dict[str, str]:
+        """`world_tags` of the task's own."""
+        return world_tags(self._env(None))
+
+    def close(self) -> None:
+        for env in self._made.values():
+            env.close()
+
+    def _env(self, variant: str | None) -> Any:
+        if variant not in self._made:
+            sim = self._spec.sim if variant is None else self._spec.simulated_as(variant)
+            self._made[variant] = make_env(self._spec.model_copy(update={"sim": sim}), cameras=self._cameras)
+        return self._made[variant]

@@ -14,6 +14,7 @@ from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, nearest
 from vilp_data.types import F32, F64, I32, U8, is_rollout
+from vilp_models.simulator import is_of_world
 
 SIDES = ("val", "train", "all")
 
@@ -74,20 +75,26 @@ def seed_starts(seeds: Sequence[int]) -> list[Start]:
 
 
 def episode_starts(
-    store: EpisodeStore, side: str, *, limit: int | None = None
+    store: EpisodeStore, side: str, *, limit: int | None = None, world: Mapping[str, str] | None = None
 ) -> tuple[list[Start], dict[int, Recording]]:
     """The first recorded state of each stored episode on a side of the split ("val", "train", or "all" there are), the first
-    `limit` of them by id; and the recordings, by the start's policy seed: `episode_seed` of their id.
+    `limit` of them by id; and the recordings, by the start's policy seed: `episode_seed` of their id. Episodes whose tags say another
+    `world` (`simulator.world_tags`) than the one to be played in are left out.
 
     Raises UsageError for an unknown side, where no such episode has actions and simulator states, or where one begins with a step
     that cannot be used; SplitError where the dataset has no split."""
     if side not in SIDES:
         raise UsageError(f"no such side of the split: {side!r}", remedy=nearest(side, SIDES))
     entries = store.index() if side == "all" else side_episodes(store, "val" if side == "val" else "train")
-    played = [entry for entry in entries if entry.has_action and entry.has_state and not is_rollout(entry.tags)][:limit]
+    played = [
+        entry
+        for entry in entries
+        if entry.has_action and entry.has_state and not is_rollout(entry.tags) and is_of_world(entry.tags, world or {})
+    ][:limit]
     if not played:
+        told = ", ".join(f"{tag} {value}" for tag, value in (world or {}).items())
         raise UsageError(
-            f"no episode of {side!r} has both actions and simulator states",
+            f"no episode of {side!r} has both actions and simulator states" + (f", and is of {told}" if told else ""),
             where=store.root,
             remedy="roll out from --seeds instead",
         )

@@ -12,12 +12,15 @@ import torch
 from pydantic import ValidationError
 
 from vilp_data.dataset import WindowDataset
+from vilp_data.dataset_action_sets import read_action_set
 from vilp_data.dataset_split import read_split, side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import BusyError, NoWindowError, UsageError, VilpDataError, nearest
+from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.pairs import PairDataset
 from vilp_data.spec import TaskSpec, WindowSpec
 from vilp_data.writer_lock import remove_leftovers, writer_lock
+from vilp_models.action_labels import SetId, epochs_text, require_same_set, set_id
 from vilp_models.checkpoint import RunState, read_recipe, read_state, run_folder
 from vilp_models.contract import ContractOf, DataContract
 from vilp_models.frames import TrainingFrames, open_clips
@@ -41,6 +44,8 @@ class Run:
     contract  of the dataset, with statistics over these episodes; None for a model that depends on frames alone
     built_by  what decides the network besides recipe and contract; as in `RunState.built_by`
     unit      what its batches hold
+    action_set
+              whose episodes alone it learns from; None for all that serve
     """
 
     model: str
@@ -51,6 +56,7 @@ class Run:
     contract: ContractOf | None = None
     built_by: Mapping[str, int] = field(default_factory=dict)
     unit: str = "samples"
+    action_set: SetId | None = None
 
     @property
     def label(self) -> str:
@@ -167,18 +173,21 @@ def train_policy(
     run_dir: Path,
     *,
     vqgan: Path | None = None,
+    action_set: str | None = None,
     restart: bool = False,
     device: str | None = None,
     show: bool = True,
 ) -> list[RunState]:
-    """Train the low-level policy of all views together, on pairs of frames (or of latents) of the episodes with actions.
+    """Train the low-level policy of all views together, on pairs of frames (or of latents) of the episodes with actions; with an
+    `action_set` of those in it alone.
 
     `vqgan` is the run whose latents it sees, or whose reconstructions it sees some of; other recipes need none. Returns and
-    raises as `train_planner`."""
+    raises as `train_planner`, and ActionSetError where the set does not hold."""
     from vilp_models.low_level import LowLevelPolicy
 
     _require_views(spec, dataset_dir)
-    episodes, split_hash = _training_side(dataset_dir, acting=True)
+    labels = None if action_set is None else read_action_set(dataset_dir, action_set)
+    episodes, split_hash = _training_side(dataset_dir, acting=True, labels=labels)
     processes = Processes(recipe.precision, device=device)
     encoders = {}
     if recipe.sees == "latents" or recipe.reconstructed_share:
@@ -189,7 +198,9 @@ def train_policy(
     views = tuple(sorted(spec.views))
 
     def contract(train: Sequence[EpisodeEntry]) -> DataContract:
-        return DataContract.of(dataset_dir, spec, train=train, latent_keys=keys, plans=False, low_dim=recipe.low_dim)
+        return DataContract.of(
+            dataset_dir, spec, train=train, latent_keys=keys, plans=False, low_dim=recipe.low_dim, labels=labels
+        )
 
     def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
         assert agreed is not None
@@ -199,7 +210,10 @@ def train_policy(
             frame_stride=spec.window.frame_stride,
             latent_keys=keys,
             with_frames=recipe.sees == "frames",
+            labels=labels,
         )
+        if labels is not None and show and processes.is_main:
+            print(f"policy {epochs_text(labels, pairs, recipe)}")
         codebooks = {view: encoder.model.quantize.embedding.weight.detach() for view, encoder in encoders.items()}
 
         def reconstruct(view: str, latents: torch.Tensor) -> torch.Tensor:
@@ -212,7 +226,8 @@ def train_policy(
 
         return ModelTraining(recipe, build, pairs, processes)
 
-    run = Run("policy", views, run_folder(run_dir, views), recipe, trainee, contract, unit="pairs")
+    folder = run_folder(run_dir, views)
+    run = Run("policy", views, folder, recipe, trainee, contract, unit="pairs", action_set=set_id(labels))
     return _bring_all_to_end([run], episodes, split_hash, processes, restart=restart, show=show)
 
 
@@ -223,40 +238,52 @@ def train_bc(
     run_dir: Path,
     *,
     n_action_steps: int,
+    action_set: str | None = None,
     restart: bool = False,
     device: str | None = None,
     show: bool = True,
 ) -> list[RunState]:
     """Train behaviour cloning of all views together: one observation to the next `n_action_steps` actions.
 
-    Only episodes with actions are read, from every step that has one: windows are as long as a chunk, whatever the planner's
-    are, and a chunk that reaches past the end is learnt as far as it was recorded. Returns and raises as `train_vqgan`."""
+    Only episodes with actions are read, with an `action_set` those in it alone, from every step that has one: windows are as long
+    as a chunk, whatever the planner's are, and a chunk that reaches past the end is learnt as far as it was recorded. Returns and
+    raises as `train_policy`."""
     from vilp_models.policies.bc import BcNetwork
 
-    episodes, split_hash = _training_side(dataset_dir, acting=True)
+    labels = None if action_set is None else read_action_set(dataset_dir, action_set)
+    episodes, split_hash = _training_side(dataset_dir, acting=True, labels=labels)
     views, stride = tuple(sorted(spec.views)), spec.window.frame_stride
     n_frames = -(-n_action_steps // stride)
     chunk = WindowSpec(n_plan_frames=n_frames, frame_stride=stride, max_goal_frames=n_frames)
 
     def contract(train: Sequence[EpisodeEntry]) -> DataContract:
-        return DataContract.of(dataset_dir, spec, train=train, plans=False, low_dim=recipe.low_dim)
+        return DataContract.of(dataset_dir, spec, train=train, plans=False, low_dim=recipe.low_dim, labels=labels)
 
     def trainee(processes: Processes, agreed: DataContract | None) -> Trainee:
         assert agreed is not None
-        windows = WindowDataset(dataset_dir, split="train", latent_keys={}, views=views, window=chunk, acting=True)
+        windows = WindowDataset(
+            dataset_dir, split="train", latent_keys={}, views=views, window=chunk, acting=True, labels=labels
+        )
+        if labels is not None and show and processes.is_main:
+            print(f"bc {epochs_text(labels, windows, recipe)}")
         return ModelTraining(recipe, lambda: BcNetwork(recipe, agreed, n_action_steps), windows, processes)
 
-    built_by = {"n_action_steps": n_action_steps}
-    run = Run("bc", views, run_folder(run_dir, views), recipe, trainee, contract, built_by, unit="windows")
+    run = Run(
+        "bc", views, run_folder(run_dir, views), recipe, trainee, contract, {"n_action_steps": n_action_steps},
+        unit="windows", action_set=set_id(labels),
+    )  # fmt: skip
     processes = Processes(recipe.precision, device=device)
     return _bring_all_to_end([run], episodes, split_hash, processes, restart=restart, show=show)
 
 
-def _training_side(dataset_dir: Path, *, acting: bool = False) -> tuple[list[EpisodeEntry], str]:
-    """Today's training episodes, those with actions where only they serve, and the split's hash."""
+def _training_side(
+    dataset_dir: Path, *, acting: bool = False, labels: LabelledEpisodes | None = None
+) -> tuple[list[EpisodeEntry], str]:
+    """Today's training episodes, those with actions where only they serve, those of an action set where one is named; and the
+    split's hash."""
     store = EpisodeStore(dataset_dir)
     episodes = [entry for entry in side_episodes(store, "train") if entry.has_action or not acting]
-    return episodes, read_split(dataset_dir).hash
+    return episodes if labels is None else labels.entries, read_split(dataset_dir).hash
 
 
 def _encoders(dataset_dir: Path, spec: TaskSpec, vqgan: Path, processes: Processes) -> dict[str, VqganEncoder]:
@@ -296,7 +323,7 @@ def _bring_to_end(
     """Train one run to its last step, on these training episodes.
 
     A finished run with this recipe and contract is left alone; an unfinished one goes on exactly where it stopped. Raises
-    UsageError where the run there has another recipe or contract, or is unfinished and has other episodes (`restart`
+    UsageError where the run there has another recipe, action set or contract, or is unfinished and has other episodes (`restart`
     begins those anew, and leaves what is there until its own first checkpoint replaces it), BusyError where another process
     trains into it, DivergedError where a loss stops being finite, KeyboardInterrupt on Ctrl-C, saved.
     """
@@ -310,6 +337,7 @@ def _bring_to_end(
             train_episodes={entry.id: entry.key for entry in episodes},
             model=run.model,
             built_by=run.built_by,
+            action_set=run.action_set,
         )
         earlier = None if restart else read_state(run.folder)
         if earlier is not None and not _must_train(run, table, wanted, earlier, episodes):
@@ -357,6 +385,7 @@ def _must_train(
     if earlier.model != wanted.model:
         found = f"{earlier.model} there, {wanted.model} now"
         raise UsageError("this folder holds a run of another model", where=run.folder, found=found, remedy=remedy)
+    require_same_set(earlier, wanted.action_set, where=run.folder)
     if changed:
         found = ", ".join(f"{key} = {old.get(key)!r} there, {recipe.get(key)!r} now" for key in changed)
         raise UsageError("this run was trained with another recipe", where=run.folder, found=found, remedy=remedy)

@@ -13,6 +13,7 @@ from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.keys import ingest_key
 from vilp_data.spec import TaskSpec, WindowSpec
+from vilp_models.action_labels import SetId, labels_of
 from vilp_models.checkpoint import (
     FILE,
     TrainedRun,
@@ -56,20 +57,22 @@ class TrainedPlanners:
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A low-level policy on `device`, ready to act; `digest` names its checkpoint."""
+    """A low-level policy on `device`, ready to act; `digest` names its checkpoint, `action_set` what it learnt from."""
 
     policy: LowLevelPolicy
     contract: DataContract
     recipe: PolicyRecipe
     digest: str
+    action_set: SetId | None = None
 
 
 @dataclass(frozen=True)
 class TrainedBc:
-    """A behaviour cloning network on its device, ready to act; `digest` names its checkpoint."""
+    """A behaviour cloning network on its device, ready to act; `digest` names its checkpoint, `action_set` what it learnt from."""
 
     network: BcNetwork
     digest: str
+    action_set: SetId | None = None
 
 
 def load_encoders(
@@ -105,27 +108,40 @@ def load_planners(
 
 
 def load_low_level(
-    store: EpisodeStore, spec: TaskSpec, run_dir: Path, encoders: Mapping[str, VqganEncoder], *, device: str = "cpu"
+    store: EpisodeStore,
+    spec: TaskSpec,
+    run_dir: Path,
+    encoders: Mapping[str, VqganEncoder],
+    *,
+    action_set: str | None = None,
+    device: str = "cpu",
 ) -> TrainedPolicy:
-    """The low-level policy in `run_dir`. Raises as `load_planners`."""
+    """The low-level policy in `run_dir`. Raises as `load_planners`, UsageError where it learnt from another action set than
+    `action_set`, and ActionSetError where that does not hold any more."""
     run = run_folder(run_dir, tuple(spec.views))
     _refuse_other_task(spec, run_dir, [run], "policy")
-    trained = _checked(store, spec, run, "policy", encoders)
+    trained = _checked(store, spec, run, "policy", encoders, action_set)
     recipe = PolicyRecipe.model_validate(trained.recipe)
     policy = LowLevelPolicy(recipe, trained.contract)
     load_arrays(policy, trained.arrays)
     policy.eval().requires_grad_(False).to(device)
-    return TrainedPolicy(policy, trained.contract, recipe, checkpoint_digest(run))
+    return TrainedPolicy(policy, trained.contract, recipe, checkpoint_digest(run), trained.state.action_set)
 
 
 def load_bc(
-    store: EpisodeStore, spec: TaskSpec, run_dir: Path, *, n_action_steps: int, device: str = "cpu"
+    store: EpisodeStore,
+    spec: TaskSpec,
+    run_dir: Path,
+    *,
+    n_action_steps: int,
+    action_set: str | None = None,
+    device: str = "cpu",
 ) -> TrainedBc:
-    """The behaviour cloning network in `run_dir`, which gives chunks of `n_action_steps`. Raises as `load_planners`, and UsageError
+    """The behaviour cloning network in `run_dir`, which gives chunks of `n_action_steps`. Raises as `load_low_level`, and UsageError
     where it was trained on chunks of another length."""
     run = run_folder(run_dir, tuple(spec.views))
     _refuse_other_task(spec, run_dir, [run], "bc")
-    trained = _checked(store, spec, run, "bc", {})
+    trained = _checked(store, spec, run, "bc", {}, action_set)
     recipe, learnt = BcRecipe.model_validate(trained.recipe), trained.state.built_by["n_action_steps"]
     if learnt != n_action_steps:
         raise UsageError(
@@ -137,7 +153,7 @@ def load_bc(
     network = BcNetwork(recipe, trained.contract, learnt)
     load_arrays(network, trained.arrays)
     network.eval().requires_grad_(False).to(device)
-    return TrainedBc(network, checkpoint_digest(run))
+    return TrainedBc(network, checkpoint_digest(run), trained.state.action_set)
 
 
 def default_device() -> str:
@@ -174,17 +190,24 @@ def _refuse_other_task(spec: TaskSpec, run_dir: Path, wanted: Sequence[Path], ki
 
 
 def _checked(
-    store: EpisodeStore, spec: TaskSpec, run: Path, kind: str, encoders: Mapping[str, VqganEncoder]
+    store: EpisodeStore,
+    spec: TaskSpec,
+    run: Path,
+    kind: str,
+    encoders: Mapping[str, VqganEncoder],
+    action_set: str | None = None,
 ) -> TrainedRun:
-    """The run, once its contract was compared with the dataset's under the encoders' latents, and its episodes with validation."""
+    """The run, once its contract was compared with the dataset's under the encoders' latents, its episodes with validation, and its
+    action set with the one asked for."""
     trained = load_run(run, kind)
     refuse_trained_on_validation(trained.state, side_episodes(store, "val"), where=run)
+    labels = labels_of(store.root, trained.state, action_set, where=run)
     there = trained.contract
     keys = {view: _key(encoders[view], known) for view, known in there.latent_keys.items() if view in encoders}
     # Another VQGAN may not have encoded these episodes, and then there are no latents to take statistics of.
     there.require_same(there.as_said_by(spec, latent_keys=keys), where=run, model=kind)
     known = [entry for entry in store.index() if entry.id in trained.state.train_episodes]
-    now = there.now(store.root, spec, known, latent_keys=keys)
+    now = there.now(store.root, spec, known, latent_keys=keys, labels=labels)
     if _some_were_taken_out(known, trained.state.train_episodes):
         # What is left has other statistics, and the model keeps its own.
         now = replace(now, normaliser=there.normaliser)

@@ -73,7 +73,7 @@ def test_every_preset_of_tasks_has_a_recipe_and_no_other_does() -> None:
         vqgan_recipe({}, preset="tinny", where="x")
 
 
-@pytest.mark.parametrize(("task", "steps"), [("hanoi", 4000), ("pusht", 7000)])
+@pytest.mark.parametrize(("task", "steps"), [("arrange_blocks", 4000), ("hanoi", 4000), ("pusht", 7000)])
 def test_the_built_in_tasks_differ_in_what_their_toml_says_alone(task: str, steps: int) -> None:
     recipe = vqgan_recipe(load_task(task, preset="cpu").models, preset="cpu", where=task)
     assert recipe.model_copy(update={"steps": 4000}) == vqgan_recipe({}, preset="cpu", where="any")

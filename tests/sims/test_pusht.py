@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.real_data import real_data
 from vilp_data.errors import UsageError
+from vilp_models.metrics import psnr
 
 pytest.importorskip("gym_pusht", reason="the simulators are not installed: make setup")
 
@@ -96,3 +98,33 @@ def test_the_same_seed_starts_at_the_same_state_and_another_does_not(env):
 def test_a_state_of_another_shape_is_refused(env):
     with pytest.raises(UsageError, match="block_angle"):
         env.reset(options={"state": np.zeros(4)})
+
+
+def test_a_moved_goal_is_where_success_is_and_where_the_picture_shows_it():
+    moved = PushTEnv(goal_pose=(356.0, 356.0, 0.0))
+    there = np.array([50.0, 450.0, 356.0, 356.0, 0.0])
+    assert moved.reset(options={"state": ON_THE_GOAL})[1]["is_success"] is False
+    assert moved.reset(options={"state": there})[1]["coverage"] == pytest.approx(1, abs=0.02)
+    assert moved.step(there[:2])[2]
+    picture = moved.reset(options={"state": ON_THE_GOAL})[0]["top"]
+    green = (picture[..., 1] > 200) & (picture[..., 0] < 180) & (picture[..., 2] < 180)
+    row, column = (np.argwhere(green).mean(axis=0) + 0.5) * 512 / 96
+    assert (330 < column < 380, 360 < row < 430) == (True, True)
+    assert moved.tags() == {"goal": "356,356,0", "object": "T"}
+    assert PushTEnv(cameras=False).tags() == {"goal": "256,256,45", "object": "T"}
+    moved.reset(seed=1)
+    assert moved.step(there[:2])[4]["coverage"] < 0.9  # a start from a seed keeps the goal too
+
+
+def test_a_goal_of_other_numbers_is_refused():
+    with pytest.raises(UsageError, match="2 numbers"):
+        PushTEnv(goal_pose=(1.0, 2.0))
+
+
+def test_the_published_frames_with_another_goal_are_drawn_as_they_are():
+    zarr = pytest.importorskip("zarr")
+    data = zarr.open(real_data("pusht/pusht_keypoint_x356_y356.zarr"), mode="r")["data"]
+    moved = PushTEnv(goal_pose=(356.0, 356.0, math.pi / 4))
+    for step in (0, 60, 120):
+        drawn = moved.reset(options={"state": np.array(data["state"][step], np.float64)})[0]["top"]
+        assert psnr(drawn, np.array(data["img"][step])) > 40

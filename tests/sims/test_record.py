@@ -116,8 +116,9 @@ def test_a_failure_is_written_and_tagged(tmp_path: Path) -> None:
 
 
 def test_a_task_without_an_expert_says_which_have_one(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="vilp/Hanoi-v0"):
-        record_task(load_task("pusht"), tmp_path, episodes=1, first_seed=0)
+    other = load_task("pusht").model_copy(update={"sim": SimSpec(env="vilp/Hanoy-v0")})
+    with pytest.raises(UsageError, match="did you mean 'vilp/Hanoi-v0'"):
+        record_task(other, tmp_path, episodes=1, first_seed=0)
 
 
 def test_a_missing_renderer_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

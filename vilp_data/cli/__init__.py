@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from vilp_data.cli import check, datasets, export, history, logs, render, salvage, surgery, view
+from vilp_data.cli import actions, check, datasets, export, history, logs, render, salvage, surgery, view
 from vilp_data.errors import VilpDataError
 
 INTERRUPTED = 130
@@ -27,6 +27,7 @@ for verb in (
     salvage.salvage,
     logs.ingest,
     datasets.split,
+    actions.actions,
     datasets.latents,
     datasets.why_stale,
     view.view,

@@ -10,7 +10,16 @@ from typing import Annotated
 import typer
 
 from vilp_data.cli.cuts import cuts_as_data, print_cuts
-from vilp_data.cli.options import JsonOption, PresetOption, TaskOption, WorkersOption, console, print_json, progress_bar
+from vilp_data.cli.options import (
+    JsonOption,
+    PresetOption,
+    TaskOption,
+    WorkersOption,
+    console,
+    label_pairs,
+    print_json,
+    progress_bar,
+)
 from vilp_data.engine import cpu_count
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError, some_of
@@ -32,27 +41,40 @@ def record(
     first_seed: Annotated[
         int | None, typer.Option(help="Seeds count up from here. Default: the task's.", show_default=False)
     ] = None,
+    variant: Annotated[
+        str | None,
+        typer.Option(
+            help="One of the task's [record.variants] alone, such as off_target. Default: the task itself and, where neither "
+            "--episodes nor --first-seed is given, all of its variants.",
+            show_default=False,
+        ),
+    ] = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Let the scripted expert of a simulated task record episode logs, one MCAP each.
 
-    Example: vilp-data record --task hanoi --episodes 24
+    Example: vilp-data record --task arrange_blocks --episodes 24
     """
-    from vilp_data.sims.record import record_task
+    from vilp_data.sims.record import RecordedEpisode, record_task
 
     spec = load_task(task, preset=preset)
     folder = out or default_root(spec.name, preset) / "logs"
-    count = episodes or spec.record.episodes
-    with progress_bar(f"recording {spec.name}", count) as advance:
-        recorded = record_task(
-            spec,
-            folder,
-            episodes=count,
-            first_seed=spec.record.first_seed if first_seed is None else first_seed,
-            workers=workers or 0,
-            progress=advance,
-        )
+    everything = variant is None and episodes is None and first_seed is None
+    recorded: list[RecordedEpisode] = []
+    for one in [variant, *(spec.record.variants if everything else ())]:
+        numbers = spec.record if one is None else spec.record.variants.get(one, spec.record)
+        count = episodes or numbers.episodes
+        with progress_bar(f"recording {spec.name}" + ("" if one is None else f", {one}"), count) as advance:
+            recorded += record_task(
+                spec,
+                folder,
+                episodes=count,
+                first_seed=numbers.first_seed if first_seed is None else first_seed,
+                variant=one,
+                workers=workers or 0,
+                progress=advance,
+            )
     succeeded = sum(episode.success for episode in recorded)
     if as_json:
         print_json([dataclasses.asdict(episode) for episode in recorded])
@@ -148,6 +170,14 @@ def ingest(
         bool,
         typer.Option("--with-rollouts", help="Store a policy's own episodes too: they never get a side of the split."),
     ] = False,
+    labels: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="KEY=VALUE, a tag of every episode in these logs; may be given several times.",
+            show_default=False,
+        ),
+    ] = None,
     again: Annotated[bool, typer.Option("--again", help="Take episodes that were removed on purpose as well.")] = False,
     show: Annotated[
         bool, typer.Option("--preview", help="Print the demonstrations in the logs, and write nothing.")
@@ -160,7 +190,9 @@ def ingest(
     Example: vilp-data ingest bags/ --task mytask.toml
     """
     from vilp_data.ingest import ingest_logs
+    from vilp_data.ingest_tags import tag_episodes
 
+    pairs = label_pairs(labels or [])
     if task:
         spec = load_task(task, preset=preset)
         root = into or default_root(spec.name, preset)
@@ -176,15 +208,18 @@ def ingest(
             logs, root, spec, workers=workers or cpu_count(), include_failures=include_failures,
             with_rollouts=with_rollouts, again=again, progress=advance,
         )  # fmt: skip
+    tagged = tag_episodes(root, spec, [*report.written, *report.fresh], pairs)
     remember(root)
     if as_json:
-        print_json(dataclasses.asdict(report))
+        print_json(dataclasses.asdict(report) | {"tagged": tagged})
     else:
         print(
             f"{root}: {len(report.written)} episodes ingested, {len(report.fresh)} already there"
             + (f", {len(report.left_out)} failures left out" if report.left_out else "")
             + (f", {len(report.failed)} could not be read" if report.failed else "")
         )
+        if tagged:
+            print(f"  {len(tagged)} got tags that their logs do not have, from the task's [tags] or --set")
         if report.rollouts:
             many = "1 rollout" if len(report.rollouts) == 1 else f"{len(report.rollouts)} rollouts"
             print(f"  {many} of a policy left out; --with-rollouts stores what no model will learn from")
@@ -228,6 +263,7 @@ def _dataset_and_its_spec(given: Path | None) -> tuple[Path, TaskSpec]:
         root = find_dataset(given)
     except UsageError as error:
         raise UsageError(
-            "which task do these logs belong to?", remedy="--task NAME or --task FILE.toml (built-in: hanoi, pusht)"
+            "which task do these logs belong to?",
+            remedy="--task NAME or --task FILE.toml (built-in: arrange_blocks, hanoi, pusht)",
         ) from error
     return root, EpisodeStore(root).spec()

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vilp_data.episodes import EpisodeStore
+from vilp_data.errors import UsageError
 from vilp_data.locate import find_dataset, remember
 from vilp_data.spec import PRESETS, TaskSpec
 
@@ -26,7 +27,9 @@ DatasetArgument = Annotated[
         show_default=False,
     ),
 ]
-TaskOption = Annotated[str, typer.Option(help="A built-in task (hanoi, pusht), or a path to a task TOML.")]
+TaskOption = Annotated[
+    str, typer.Option(help="A built-in task (arrange_blocks, hanoi, pusht), or a path to a task TOML.")
+]
 PresetOption = Annotated[
     str | None, typer.Option(help=f"Overrides from the task's [presets]: {', '.join(PRESETS)}.", show_default=False)
 ]
@@ -40,6 +43,17 @@ def open_dataset(given: Path | None) -> tuple[Path, TaskSpec]:
         console.print(f"dataset: {root}", highlight=False)
     remember(root)
     return root, EpisodeStore(root).spec()
+
+
+def label_pairs(labels: list[str]) -> dict[str, str]:
+    """KEY=VALUE texts as a mapping. Raises UsageError for another."""
+    pairs = {}
+    for label in labels:
+        key, equals, value = label.partition("=")
+        if not equals or not key.strip():
+            raise UsageError("not a label", found=repr(label), remedy="--set KEY=VALUE, such as --set operator=anna")
+        pairs[key.strip()] = value
+    return pairs
 
 
 def print_json(value: Any) -> None:

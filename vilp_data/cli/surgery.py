@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vilp_data.cli.options import JsonOption, open_dataset, print_json
+from vilp_data.cli.options import JsonOption, label_pairs, open_dataset, print_json
 from vilp_data.errors import UsageError
 
 EpisodesArgument = Annotated[list[str], typer.Argument(help="Ids of episodes.", show_default=False)]
@@ -164,12 +164,7 @@ def merge(
 
 
 def _pairs(labels: list[str], outcome: str | None) -> dict[str, str]:
-    pairs = {}
-    for label in labels:
-        key, equals, value = label.partition("=")
-        if not equals or not key.strip():
-            raise UsageError("not a label", found=repr(label), remedy="--set KEY=VALUE, such as --set operator=anna")
-        pairs[key.strip()] = value
+    pairs = label_pairs(labels)
     if outcome is not None:
         if outcome not in ("success", "failure"):
             raise UsageError("no such outcome", found=outcome, remedy="--outcome success or --outcome failure")

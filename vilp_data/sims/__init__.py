@@ -5,10 +5,12 @@ Importing this package needs no simulator. `register()` makes the environments k
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import logging
 import os
 import sys
+from typing import Any
 
 from vilp_data.errors import UsageError
 
@@ -18,6 +20,7 @@ if sys.platform.startswith("linux"):
 logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
 
 ENVIRONMENTS = {
+    "vilp/ArrangeBlocks-v0": "vilp_data.sims.arrange_blocks:ArrangeBlocksEnv",
     "vilp/Hanoi-v0": "vilp_data.sims.hanoi:HanoiEnv",
     "vilp/PushT-v0": "vilp_data.sims.pusht:PushTEnv",
 }
@@ -32,3 +35,9 @@ def register() -> None:
     for name, entry_point in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(id=name, entry_point=entry_point)
+
+
+def load_entry_point(name: str) -> Any:
+    """What "module:name" names; its packages are imported now."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)

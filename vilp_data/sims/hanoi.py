@@ -159,6 +159,11 @@ class HanoiEnv(gymnasium.Env[dict[str, Any], F32]):  # type: ignore[misc]  # gym
     def gripper_names(self) -> list[str]:
         return [name.removeprefix("gripper0_right_") for name in self.scene.robots[0].gripper_joints["right"]]
 
+    def tags(self) -> dict[str, str]:
+        """What sets this episode apart from others of the task."""
+        goal, angle = f"peg{self.goal_peg}", f"{self.base_angle:.6f}"
+        return {"goal": goal, "object": "discs", "n_discs": str(self.n_discs), "base_angle": angle}
+
     def write_tick(
         self, log: EpisodeRecorder, stamp_ns: int, observation: Mapping[str, Any], info: Mapping[str, Any], action: F32
     ) -> None:

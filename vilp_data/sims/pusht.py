@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,12 +24,14 @@ from gymnasium.spaces import Box, Dict
 
 FRAME_SIZE = 96
 BOARD_SIZE = 512.0
+GOAL_POSE = (256.0, 256.0, math.pi / 4)
+"""x, y in px of 512, angle in radians: the benchmark's."""
 
 Observation = dict[str, U8 | F32]
 
 
 class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional extra that the type check leaves out
-    """Push the T onto its goal with a disc that chases a target position.
+    """Push the T onto its goal with a disc that chases a target position. `goal_pose` [3] moves the goal: x, y, px of 512, and angle.
 
     Observation  "top" (with cameras): uint8 [96,96,3] RGB, top row first; "low_dim": float32 [2], the agent's position, px of 512
     Action       float32 [2], where the agent is to go, px of 512; in force for 0.1 s (ten steps of a PD controller)
@@ -52,15 +55,36 @@ class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional
         "replay_tolerance": 1e-3,
     }
 
-    def __init__(self, render_mode: str | None = None, *, cameras: bool = True) -> None:
+    def __init__(
+        self, render_mode: str | None = None, *, cameras: bool = True, goal_pose: Sequence[float] = GOAL_POSE
+    ) -> None:
         self.render_mode = render_mode
         self.cameras = cameras
+        self.goal_pose = np.array(goal_pose, np.float64)
+        if self.goal_pose.shape != (3,):
+            found = f"{len(goal_pose)} numbers"
+            raise UsageError("a goal is x, y in px of 512 and an angle in radians", where="goal_pose", found=found)
         self.action_space = Box(0.0, BOARD_SIZE, (2,), np.float32)
         spaces = {"low_dim": Box(-np.inf, np.inf, (2,), np.float32)}  # the walls stop the block, not the agent
         if cameras:
             spaces["top"] = Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         self.observation_space = Dict(spaces)
         self._sim = GymPushT(obs_type="state", observation_width=FRAME_SIZE, observation_height=FRAME_SIZE)
+
+    @property
+    def agent(self) -> F64:
+        """Its position, float64 [2], px of 512."""
+        return np.array(self._sim.agent.position)
+
+    @property
+    def block(self) -> F64:
+        """Its pose, float64 [3]: x, y of the middle of the bar's outer edge in px of 512, angle in radians, not wrapped."""
+        return np.array((*self._sim.block.position, self._sim.block.angle))
+
+    def tags(self) -> dict[str, str]:
+        """What sets an episode of this environment apart from one of another goal."""
+        x, y, angle = self.goal_pose
+        return {"goal": f"{x:g},{y:g},{math.degrees(angle):.0f}", "object": "T"}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -72,6 +96,7 @@ class PushTEnv(gymnasium.Env):  # type: ignore[misc]  # gymnasium is an optional
             self._place(np.asarray(options["state"], np.float64))
         else:
             self._sim.reset(seed=seed)
+        self._sim.goal_pose = self.goal_pose.copy()  # which every reset puts where the benchmark has it
         coverage = self._sim._get_coverage()
         return self._observe(), self._info(coverage, is_success=coverage > self._sim.success_threshold)
 

@@ -1,9 +1,9 @@
 """Record demonstrations: the scripted expert of a task drives its environment, and each episode becomes one log.
 
-    t_k = t_0 + k / 10 Hz     cameras and joints measure, the simulator's state is taken, then action k is issued; all stamped t_k
-    t_k + 50 ms               joints, end effector and gripper measure again
+    t_k = t_0 + k / rate     cameras and joints measure, the simulator's state is taken, then action k is issued; all stamped t_k
 
-The last tick holds the final observation and the command to stand still, so every tick has both.
+Hanoi's joints, end effector and gripper measure again at t_k + 50 ms. The last tick holds the final observation and the command to
+stand still, so every tick has both.
 """
 
 from __future__ import annotations
@@ -14,24 +14,60 @@ import importlib.util
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import EpisodeRecorder
-from vilp_data.sims.episode_log import START_NS
+from vilp_data.sims import ENVIRONMENTS, load_entry_point
+from vilp_data.sims.episode_log import START_NS, tick_writer
 from vilp_data.sims.finished_log import finished_tags
-from vilp_data.spec import TaskSpec
+from vilp_data.spec import SimSpec, TaskSpec
+from vilp_data.types import F32
 
-if TYPE_CHECKING:
-    from vilp_data.sims.hanoi import HanoiEnv
 
-TICK_NS = 100_000_000
-RECORDABLE = ("vilp/Hanoi-v0",)
+class Expert(Protocol):
+    """Made as `Kind(env, seed=seed)` from an environment that was just reset; `seed` is for what it does now this way, now that.
+
+    goes_on_after_success  whether it may end its last move when the environment has called the episode a success
+    """
+
+    goes_on_after_success: bool
+
+    def actions(self) -> Iterator[F32]:
+        """Float32 [A] each; the environment is stepped with one before the next is asked for."""
+        ...
+
+    def tags(self) -> Mapping[str, str]:
+        """How it does this episode."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Recordable:
+    """The expert of an environment ("module:Class"), the packages that both need, and those whose version a log states."""
+
+    expert: str
+    packages: tuple[str, ...]
+    stated: tuple[str, ...]
+
+
+RECORDABLE = {
+    "vilp/ArrangeBlocks-v0": _Recordable(
+        "vilp_data.sims.arrange_blocks_expert:ArrangeBlocksExpert", ("gymnasium", "pymunk"), ("pymunk",)
+    ),
+    "vilp/Hanoi-v0": _Recordable(
+        "vilp_data.sims.hanoi_expert:HanoiExpert", ("gymnasium", "mujoco", "robosuite"), ("robosuite", "mujoco")
+    ),
+    "vilp/PushT-v0": _Recordable(
+        "vilp_data.sims.pusht_expert:PushTExpert", ("gymnasium", "gym_pusht", "pymunk"), ("gym-pusht", "pymunk")
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -46,8 +82,9 @@ class RecordedEpisode:
 
 @dataclass(frozen=True)
 class _Job:
-    task: str
-    options: Mapping[str, Any]
+    spec: TaskSpec
+    sim: SimSpec  # with the variant's options
+    variant: str | None
     path: Path
     seed: int
 
@@ -58,26 +95,29 @@ def record_task(
     *,
     episodes: int,
     first_seed: int,
+    variant: str | None = None,
     workers: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[RecordedEpisode]:
     """Record one episode for each of `episodes` seeds from `first_seed` on, into `out_dir/<task>-seed0000007.mcap`.
 
     A finished log of the same seed and options is kept; anything unfinished is made again. Failures of the expert are written too,
-    with success "false" in their metadata. `spec.sim.options` go to the environment. `workers` 0 means one process
-    for each core. `progress` hears (done, total) after each; the list returned is in order of seed.
+    with success "false" in their metadata: it may take as many steps as a policy (`spec.sim.max_steps`). `spec.sim.options` go to the
+    environment, those of `variant` (one of `spec.record.variants`) on top; its logs are `<task>-<variant>-seed…` and say so. `workers` 0
+    means one process for each core. `progress` hears (done, total) after each; the list returned is in order of seed.
 
     Raises UsageError where the task has no scripted expert, the simulator is not installed, or a log in `out_dir` was made with
-    other options.
+    other options; SpecError for a variant that it does not have.
     """
     if spec.sim is None or spec.sim.env not in RECORDABLE:
         env = "no [sim] table" if spec.sim is None else spec.sim.env
         raise UsageError(
             "there is no scripted expert for this task", where=spec.name, found=env, remedy=nearest(env, RECORDABLE)
         )
-    options = spec.sim.options
+    name = spec.name if variant is None else f"{spec.name}-{variant}"
+    sim = spec.sim if variant is None else spec.simulated_as(variant)
     jobs = [
-        _Job(spec.name, options, _log_path(out_dir, spec.name, seed), seed)
+        _Job(spec, sim, variant, out_dir / f"{name}-seed{seed:07d}.mcap", seed)
         for seed in range(first_seed, first_seed + episodes)
     ]
     done = {job.seed: kept for job in jobs if (kept := _finished(job)) is not None}
@@ -85,7 +125,7 @@ def record_task(
     if progress is not None:
         progress(len(done), len(jobs))
     if todo:
-        require_simulator(cameras=bool(options.get("cameras", True)))
+        _require_for(sim)
     with contextlib.closing(map_unordered(_record_one, todo, workers=workers or cpu_count())) as recorded:
         for job, episode in recorded:
             done[job.seed] = episode
@@ -94,13 +134,17 @@ def record_task(
     return [done[job.seed] for job in jobs]
 
 
+def _require_for(sim: SimSpec) -> None:
+    packages = RECORDABLE[sim.env].packages
+    if "robosuite" in packages:
+        require_simulator(cameras=bool(sim.options.get("cameras", True)))
+    else:
+        _require_packages(packages)
+
+
 def require_simulator(*, cameras: bool) -> None:
     """UsageError with the one command that helps, where robosuite or the software renderer is missing."""
-    missing = [name for name in ("gymnasium", "mujoco", "robosuite") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageError(
-            "the simulator is not installed", found=f"no package called {', '.join(missing)}", remedy="make setup"
-        )
+    _require_packages(RECORDABLE["vilp/Hanoi-v0"].packages)
     draws_in_software = sys.platform.startswith("linux") and os.environ.get("MUJOCO_GL", "osmesa") == "osmesa"
     if cameras and draws_in_software and ctypes.util.find_library("OSMesa") is None:
         raise UsageError(
@@ -110,8 +154,12 @@ def require_simulator(*, cameras: bool) -> None:
         )
 
 
-def _log_path(folder: Path, task: str, seed: int) -> Path:
-    return folder / f"{task}-seed{seed:07d}.mcap"
+def _require_packages(names: Sequence[str]) -> None:
+    missing = [name for name in names if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            "the simulator is not installed", found=f"no package called {', '.join(missing)}", remedy="make setup"
+        )
 
 
 def _finished(job: _Job) -> RecordedEpisode | None:
@@ -127,42 +175,45 @@ def _finished(job: _Job) -> RecordedEpisode | None:
 
 
 def _options_text(job: _Job) -> str:
-    return json.dumps(dict(job.options), sort_keys=True)
+    return json.dumps(dict(job.sim.options), sort_keys=True)
 
 
 def _record_one(job: _Job) -> RecordedEpisode:
     """Runs in a worker process: the simulator is imported here."""
-    from vilp_data.sims.hanoi import HanoiEnv
-    from vilp_data.sims.hanoi_expert import HanoiExpert
-
-    env = HanoiEnv(**job.options)
+    try:
+        env = load_entry_point(ENVIRONMENTS[job.sim.env])(**job.sim.options)
+    except TypeError as error:
+        remedy = "compare the options of [sim] and of its [record.variants] with the environment's"
+        raise UsageError(
+            "the simulator does not take these options", where=job.sim.env, found=error, remedy=remedy
+        ) from error
     try:
         observation, info = env.reset(seed=job.seed)
-        expert = HanoiExpert(env)
-        with EpisodeRecorder(job.path, metadata=_tags(job, env), seed=job.seed) as log:
-            tick = 0
-            for action in expert.actions():
-                env.write_tick(log, START_NS + tick * TICK_NS, observation, info, action)
+        expert: Expert = load_entry_point(RECORDABLE[job.sim.env].expert)(env, seed=job.seed)
+        write = tick_writer(job.spec, env)
+        with EpisodeRecorder(job.path, metadata=_tags(job, env, expert), seed=job.seed) as log:
+            tick, tick_ns = 0, round(1e9 / (job.spec.rate_hz or env.metadata["render_fps"]))
+            for action in islice(expert.actions(), job.sim.max_steps):
+                write(log, START_NS + tick * tick_ns, observation, info, action)
                 observation, _, terminated, truncated, info = env.step(action)
                 tick += 1
-                if terminated or truncated:
+                if truncated or (terminated and not expert.goes_on_after_success):
                     break
-            env.write_tick(log, START_NS + tick * TICK_NS, observation, info, expert.hold())
+            write(log, START_NS + tick * tick_ns, observation, info, info["hold_action"])
             log.metadata.update(success=str(info["is_success"]).lower(), n_steps=str(tick))
     finally:
         env.close()
     return RecordedEpisode(job.path, job.seed, bool(info["is_success"]), tick)
 
 
-def _tags(job: _Job, env: HanoiEnv) -> dict[str, str]:
+def _tags(job: _Job, env: Any, expert: Expert) -> dict[str, str]:
     return {
-        "task": job.task,
+        "task": job.spec.name,
         "seed": str(job.seed),
-        "goal": f"peg{env.goal_peg}",
-        "object": "discs",
-        "n_discs": str(env.n_discs),
-        "base_angle": f"{env.base_angle:.6f}",
+        **env.tags(),
+        **expert.tags(),
+        **({} if job.variant is None else {"variant": job.variant}),
         "policy": "scripted_expert",
         "options": _options_text(job),
-        **{f"{name}_version": version(name) for name in ("vilp", "robosuite", "mujoco")},
+        **{f"{name}_version": version(name) for name in ("vilp", *RECORDABLE[job.sim.env].stated)},
     }

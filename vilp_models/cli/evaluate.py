@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vilp_data.cli.options import JsonOption, PresetOption, print_json, progress_bar
+from vilp_data.cli.options import JsonOption, PresetOption, label_pairs, print_json, progress_bar
 from vilp_data.episodes import EpisodeStore
 from vilp_models.cli.options import (
     DataOption,
@@ -15,6 +15,7 @@ from vilp_models.cli.options import (
     ModelRunOption,
     NoiseSeedOption,
     SamplerOption,
+    SetOption,
     TaskOption,
     VqganOption,
     dataset_of,
@@ -103,6 +104,11 @@ def evaluate_policy(
     data: DataOption = None,
     run: ModelRunOption = None,
     vqgan: VqganOption = None,
+    action_set: SetOption = None,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(help="KEY=VALUE: on episodes with this tag alone; several must all fit.", show_default=False),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Report the low-level policy's errors on held-out pairs, true and reconstructed, beside the mean action, the last one and staying.
@@ -113,10 +119,12 @@ def evaluate_policy(
     from vilp_models.policy_page import summary
 
     root, spec = dataset_of(data, task, preset)
-    folder = find_model_run(root, "policy", given=run, preset=preset)
+    folder = find_model_run(root, "policy", given=run, preset=preset, action_set=action_set)
     vqgan_run = find_model_run(root, "vqgan", given=vqgan, preset=preset, option="--vqgan")
     with progress_bar("acting", None) as advance:
-        table, report = evaluate(root, spec, folder, vqgan_run, progress=advance)
+        table, report = evaluate(
+            root, spec, folder, vqgan_run, action_set=action_set, where=label_pairs(where or []), progress=advance
+        )
     print_json(table) if as_json else print("\n".join(summary(table, report)))
     if table["warnings"]:
         raise typer.Exit(1)

@@ -34,6 +34,14 @@ VqganOption = Annotated[
         show_default=False,
     ),
 ]
+SetOption = Annotated[
+    str | None,
+    typer.Option(
+        "--set",
+        help="The action set (`vilp-data actions`) to learn from, or learnt from; its runs are MODEL-PRESET-SET. Default: none.",
+        show_default=False,
+    ),
+]
 RestartOption = Annotated[
     bool, typer.Option("--restart", help="Begin anew, though a run of another recipe or dataset is there.")
 ]

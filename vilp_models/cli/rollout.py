@@ -16,6 +16,7 @@ from vilp_models.cli.options import (
     DataOption,
     DenoisingStepsOption,
     SamplerOption,
+    SetOption,
     TaskOption,
     VqganOption,
     dataset_of,
@@ -39,7 +40,8 @@ def rollout(
     from_episodes: Annotated[
         str | None,
         typer.Option(
-            help="Start at the first recorded state of episodes: val, train or all. Default for oracle: val.",
+            help="Start at the first recorded state of the task's own episodes (not of other goals or objects): val, train or all. "
+            "Default for oracle: val.",
             show_default=False,
         ),
     ] = None,
@@ -62,9 +64,10 @@ def rollout(
     ] = True,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder. Default: DATA/rollouts/POLICY-PRESET-SETTINGS-STARTS.", show_default=False),
+        typer.Option(help="Folder. Default: DATA/rollouts/POLICY-PRESET-SET-SETTINGS-STARTS.", show_default=False),
     ] = None,
     vqgan: VqganOption = None,
+    action_set: SetOption = None,
     denoising_steps: DenoisingStepsOption = None,
     sampler: SamplerOption = None,
     precision: Annotated[
@@ -102,18 +105,23 @@ def rollout(
         raise UsageError("episodes start at seeds or at recorded states, not both", remedy="leave one of them out")
     n_steps = max_steps or require_simulator(spec).max_steps
     side = from_episodes or ("val" if seeds is None and policy in FOLLOWS_RECORDINGS else None)
-    starts, recordings, what = _starts(root, seeds or "0:50", side, episodes)
+    starts, recordings, what = _starts(root, spec, seeds or "0:50", side, episodes)
     settings = _settings(denoising_steps, sampler, precision)
     if settings and policy != "vilp":
         remedy = "leave --denoising-steps, --sampler and --precision out, or roll out vilp"
         raise UsageError(f"the policy {policy!r} imagines nothing", found=", ".join(settings), remedy=remedy)
+    if action_set is not None and policy not in HAS_MODELS:
+        raise UsageError(
+            f"the policy {policy!r} learns from nothing", found=f"--set {action_set}", remedy="leave --set out"
+        )
     recipe = load_recipe(VilpRecipe, "vilp", spec.models, preset=preset, where=spec.name)
     request = PolicyRequest(
         root, spec, preset, recipe.n_action_steps, device=device or default_device(), recordings=recordings,
-        vqgan=vqgan, denoising_steps=denoising_steps, sampler=sampler, precision=precision,
+        vqgan=vqgan, action_set=action_set, denoising_steps=denoising_steps, sampler=sampler, precision=precision,
     )  # fmt: skip
     acting = load_policy(policy, request)
-    models = [*([preset] if preset else []), *([vqgan.name] if vqgan else [])] if policy in HAS_MODELS else []
+    chosen = [preset, action_set, vqgan and vqgan.name]
+    models = [name for name in chosen if name] if policy in HAS_MODELS else []
     label = what.replace(":", "-")
     folder = out or root / "rollouts" / "-".join([policy, *models, *settings, label])
     stay = root / "rollouts" / f"stay-{label}"
@@ -130,14 +138,17 @@ def rollout(
 
 
 def _starts(
-    root: Path, seeds: str, side: str | None, episodes: int | None
+    root: Path, spec: TaskSpec, seeds: str, side: str | None, episodes: int | None
 ) -> tuple[list[Start], Mapping[int, Recording], str]:
     """The starts, the recordings that they have, and what to call them: episodes of a side of the split, else seeds."""
+    from vilp_models.simulator import Worlds
     from vilp_models.starts import episode_starts, parse_seeds, seed_starts
 
     if side is None:
         return seed_starts(parse_seeds(seeds)), {}, seeds
-    starts, recordings = episode_starts(EpisodeStore(root), side, limit=episodes)
+    world = Worlds(spec, cameras=False)
+    starts, recordings = episode_starts(EpisodeStore(root), side, limit=episodes, world=world.own_tags())
+    world.close()
     return starts, recordings, side if episodes is None else f"{side}-{len(starts)}"
 
 
@@ -149,14 +160,15 @@ def _settings(denoising_steps: int | None, sampler: str | None, precision: str) 
 
 def _prove_replay(root: Path, spec: TaskSpec, *, episodes: int | None, render: bool, as_json: bool) -> None:
     from vilp_models.replay import format_render, format_replay, render_match, replay
-    from vilp_models.simulator import make_env
+    from vilp_models.simulator import Worlds
 
     store = EpisodeStore(root)
-    env = make_env(spec, cameras=render)
-    tolerance = env.metadata.get("replay_tolerance")
+    worlds = Worlds(spec, cameras=render)
     reports, failed = [], 0
     for entry in store.index()[:episodes]:
         episode = store.read(entry.id)
+        env = worlds.of(episode.tags)
+        tolerance = env.metadata.get("replay_tolerance")
         report = replay(episode, env)
         reports.append(dataclasses.asdict(report))
         failed += tolerance is not None and not report.proves(tolerance)
@@ -168,7 +180,7 @@ def _prove_replay(root: Path, spec: TaskSpec, *, episodes: int | None, render: b
             reports[-1]["render"] = dataclasses.asdict(match)
         if not as_json:
             print("\n".join(lines))
-    env.close()
+    worlds.close()
     if as_json:
         print_json(reports)
     if failed:

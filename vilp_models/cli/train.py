@@ -6,7 +6,15 @@ import typer
 
 from vilp_data.cli.options import PresetOption
 from vilp_data.episodes import EpisodeStore
-from vilp_models.cli.options import DataOption, RestartOption, RunOption, TaskOption, VqganOption, dataset_of
+from vilp_models.cli.options import (
+    DataOption,
+    RestartOption,
+    RunOption,
+    SetOption,
+    TaskOption,
+    VqganOption,
+    dataset_of,
+)
 from vilp_models.runs import default_run, find_model_run
 
 app = typer.Typer(
@@ -74,6 +82,7 @@ def train_policy(
     data: DataOption = None,
     run: RunOption = None,
     vqgan: VqganOption = None,
+    action_set: SetOption = None,
     restart: RestartOption = False,
 ) -> None:
     """Train the low-level policy, from two frames to the actions between; goes on where it stopped.
@@ -87,11 +96,11 @@ def train_policy(
 
     root, spec = dataset_of(data, task, preset)
     recipe = load_recipe(PolicyRecipe, "policy", spec.models, preset=preset, where=spec.name)
-    folder = run or default_run(root, "policy", preset)
+    folder = run or default_run(root, "policy", preset, action_set)
     vqgan_run = None
     if recipe.sees == "latents" or recipe.reconstructed_share > 0:
         vqgan_run = find_model_run(root, "vqgan", given=vqgan, preset=preset, option="--vqgan")
-    train(root, spec, recipe, folder, vqgan=vqgan_run, restart=restart)
+    train(root, spec, recipe, folder, vqgan=vqgan_run, action_set=action_set, restart=restart)
 
 
 @app.command("bc")
@@ -100,6 +109,7 @@ def train_bc(
     preset: PresetOption = None,
     data: DataOption = None,
     run: RunOption = None,
+    action_set: SetOption = None,
     restart: RestartOption = False,
 ) -> None:
     """Train behaviour cloning, one observation to the next n_action_steps actions: a baseline; goes on where it stopped.
@@ -112,5 +122,5 @@ def train_bc(
     root, spec = dataset_of(data, task, preset)
     recipe = load_recipe(BcRecipe, "bc", spec.models, preset=preset, where=spec.name)
     vilp = load_recipe(VilpRecipe, "vilp", spec.models, preset=preset, where=spec.name)
-    folder = run or default_run(root, "bc", preset)
-    train(root, spec, recipe, folder, n_action_steps=vilp.n_action_steps, restart=restart)
+    folder = run or default_run(root, "bc", preset, action_set)
+    train(root, spec, recipe, folder, n_action_steps=vilp.n_action_steps, action_set=action_set, restart=restart)

@@ -14,6 +14,7 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError, nearest
 from vilp_data.spec import TaskSpec
 from vilp_data.types import F32, U8
+from vilp_models.action_labels import SetId, set_text
 from vilp_models.checkpoint import checkpoint_digest, run_for_view
 from vilp_models.planner import Sampler
 from vilp_models.policies.base import Policy
@@ -25,6 +26,9 @@ from vilp_models.vqgan import VqganEncoder
 DIGITS = 16
 """Of a checkpoint's digest, as reports and logs name it."""
 
+LEARNS_FROM_ACTIONS = frozenset({"policy", "bc"})
+"""Kinds of models that may be trained by an action set."""
+
 
 @dataclass(frozen=True)
 class PolicyRequest:
@@ -33,6 +37,7 @@ class PolicyRequest:
     device      where all of its networks run
     recordings  those that episodes start from, by policy seed; none where the simulator draws the starts
     vqgan       the run of the VQGANs, where another than the preset's
+    action_set  the set that its low-level policy, or its cloned behaviour, learnt from (runs/policy-PRESET-SET, …)
     denoising_steps, sampler, precision
                 of a policy that imagines, as `VilpPolicy` takes them
     """
@@ -44,6 +49,7 @@ class PolicyRequest:
     device: str = "cpu"
     recordings: Mapping[int, Recording] = field(default_factory=dict)
     vqgan: Path | None = None
+    action_set: str | None = None
     denoising_steps: int | None = None
     sampler: Sampler | None = None
     precision: Precision = "f32"
@@ -52,12 +58,15 @@ class PolicyRequest:
         """Folder of the runs of one kind of model. Raises UsageError where there is none, or it is not clear which."""
         if kind == "vqgan":
             return find_model_run(self.root, kind, given=self.vqgan, preset=self.preset, option="--vqgan")
-        return find_model_run(self.root, kind, preset=self.preset, option="--preset")
+        action_set = self.action_set if kind in LEARNS_FROM_ACTIONS else None
+        return find_model_run(self.root, kind, preset=self.preset, action_set=action_set, option="--preset")
 
-    def tags(self, **checkpoints: str) -> dict[str, str]:
-        """What was run, for report and logs: digests, cut short, and the split that the models' episodes were checked against."""
+    def tags(self, action_set: SetId | None, **checkpoints: str) -> dict[str, str]:
+        """What was run, for report and logs: digests, cut short, the action set if one was learnt from, and the split that the
+        models' episodes were checked against."""
         digests = {name: digest[:DIGITS] for name, digest in checkpoints.items()}
-        return {**digests, "split": read_split(self.root).hash[:DIGITS]}
+        learnt = {} if action_set is None else {"action_set": set_text(action_set)}
+        return {**digests, **learnt, "split": read_split(self.root).hash[:DIGITS]}
 
     def vqgan_checkpoints(self) -> dict[str, str]:
         """Tag -> digest of each view's VQGAN, decoder and codebook included, which latents do not tell apart."""
@@ -104,11 +113,13 @@ def _oracle(request: PolicyRequest) -> Policy:
     from vilp_models.trained import load_low_level
 
     store, encoders = EpisodeStore(request.root), request.encoders()
-    trained = load_low_level(store, request.spec, request.run_dir("policy"), encoders, device=request.device)
+    trained = load_low_level(
+        store, request.spec, request.run_dir("policy"), encoders, action_set=request.action_set, device=request.device
+    )
     encodes = trained.recipe.sees == "latents"
     encode = partial(_latents, encoders) if encodes else None
     vqgans = request.vqgan_checkpoints() if encodes else {}
-    tags = request.tags(policy_checkpoint=trained.digest, **vqgans)
+    tags = request.tags(trained.action_set, policy_checkpoint=trained.digest, **vqgans)
     return OraclePolicy(
         trained.policy, request.recordings, n_action_steps=request.n_action_steps, encode=encode, tags=tags
     )
@@ -125,9 +136,9 @@ def _bc(request: PolicyRequest) -> Policy:
 
     trained = load_bc(
         EpisodeStore(request.root), request.spec, request.run_dir("bc"), n_action_steps=request.n_action_steps,
-        device=request.device,
+        action_set=request.action_set, device=request.device,
     )  # fmt: skip
-    return BcPolicy(trained.network, tags=request.tags(bc_checkpoint=trained.digest))
+    return BcPolicy(trained.network, tags=request.tags(trained.action_set, bc_checkpoint=trained.digest))
 
 
 def _vilp(request: PolicyRequest) -> Policy:
@@ -138,7 +149,10 @@ def _vilp(request: PolicyRequest) -> Policy:
     planned = load_planners(
         store, request.spec, request.run_dir("planner"), request.run_dir("vqgan"), device=request.device
     )
-    low_level = load_low_level(store, request.spec, request.run_dir("policy"), planned.encoders, device=request.device)
+    low_level = load_low_level(
+        store, request.spec, request.run_dir("policy"), planned.encoders,
+        action_set=request.action_set, device=request.device,
+    )  # fmt: skip
     planners = {f"planner_checkpoint_{view}": digest for view, digest in planned.digests.items()}
     return VilpPolicy(
         planned.planners,
@@ -148,7 +162,9 @@ def _vilp(request: PolicyRequest) -> Policy:
         denoising_steps=request.denoising_steps,
         sampler=request.sampler,
         precision=request.precision,
-        tags=request.tags(policy_checkpoint=low_level.digest, **planners, **request.vqgan_checkpoints()),
+        tags=request.tags(
+            low_level.action_set, policy_checkpoint=low_level.digest, **planners, **request.vqgan_checkpoints()
+        ),
     )
 
 

@@ -1,0 +1,54 @@
+"""Which environment an episode belongs to: the task's own, or that of one of its variants."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.stored_episodes import episode, write_dataset
+from vilp_data.episodes import EpisodeStore
+from vilp_data.errors import UsageError
+from vilp_data.spec import load_task
+from vilp_models.simulator import Worlds, is_of_world, world_tags
+from vilp_models.starts import episode_starts
+
+WORLD = {"goal": "row", "object": "gray_blocks"}
+
+
+def test_an_episode_is_of_a_world_unless_one_of_its_tags_says_another() -> None:
+    assert is_of_world({"goal": "row", "object": "gray_blocks", "seed": "3"}, WORLD)
+    assert is_of_world({"operator": "me"}, WORLD)  # recorded before there were such tags, or by people
+    assert is_of_world({"goal": "column"}, {})  # an environment that says nothing of itself
+    assert not is_of_world({"goal": "row", "object": "purple_blocks"}, WORLD)
+
+
+@pytest.mark.sim
+def test_each_episode_gets_the_environment_whose_tags_it_has_and_the_tasks_own_where_none_has() -> None:
+    pytest.importorskip("gym_pusht", reason="the simulators are not installed: make setup")
+    worlds = Worlds(load_task("pusht"), cameras=False)
+    own, moved = worlds.of({"goal": "256,256,45"}), worlds.of({"goal": "356,356,45", "object": "T"})
+    assert (world_tags(own)["goal"], world_tags(moved)["goal"]) == ("256,256,45", "356,356,45")
+    assert worlds.of({}) is own
+    assert worlds.of({"goal": "1,2,3"}) is own
+    assert worlds.of({"goal": "356,356,45"}) is moved  # made once
+    assert worlds.own_tags() == {"goal": "256,256,45", "object": "T"}
+    worlds.close()
+
+
+def test_episodes_of_other_worlds_are_no_starts(tmp_path: Path) -> None:
+    tagged = [
+        replace(episode(name, 6), tags={"object": colour}, state=np.zeros((6, 2)))
+        for name, colour in (("a", "gray_blocks"), ("b", "purple_blocks"), ("c", "gray_blocks"))
+    ]
+    write_dataset(tmp_path, *tagged)
+    store = EpisodeStore(tmp_path)
+    assert [start.name for start in episode_starts(store, "all")[0]] == ["a", "b", "c"]
+    starts, recordings = episode_starts(store, "all", world=WORLD)
+    assert [start.name for start in starts] == ["a", "c"]
+    assert set(recordings) == {start.policy_seed for start in starts}
+    assert [start.name for start in episode_starts(store, "all", world=WORLD, limit=2)[0]] == ["a", "c"]
+    with pytest.raises(UsageError, match="green_blocks"):
+        episode_starts(store, "all", world={"object": "green_blocks"})
