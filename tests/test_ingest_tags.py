@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from tests.synthetic import write_zarr
 from tests.test_cli import ZARR_TASK
+from vilp_data import history
 from vilp_data.cli import app
 from vilp_data.episodes import EpisodeStore
 from vilp_data.spec import parse_task
-from vilp_data.surgery import history
 from vilp_data.surgery.operations import relabel_episodes
 
 TASK = ZARR_TASK + '[tags."demo*.zarr"]\ngoal = "here"\n[tags."demo2.zarr"]\nobject = "T"\n'
