@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -16,13 +17,17 @@ STATE_WORDS = ("joint", "pose", "gripper", "state")
 
 @dataclass
 class Plot:
-    """One time series panel: the values of each series over time, NaN where a message lacked one."""
+    """One time series panel: the values of each series over time, NaN where a message lacked one.
+
+    `over` are drawn into the same panel, each in its own style; their colours begin anew, so that what belongs together can look so."""
 
     title: str
     entity: str
     names: list[str] = field(default_factory=list)
     times_ns: list[int] = field(default_factory=list)
     rows: list[list[float]] = field(default_factory=list)
+    style: Literal["line", "faint", "points"] = "line"
+    over: tuple[Plot, ...] = ()
 
     def add(self, time_ns: int, values: Mapping[str, float]) -> None:
         self.names += [name for name in values if name not in self.names]

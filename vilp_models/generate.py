@@ -17,13 +17,13 @@ from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.latents import open_latents
+from vilp_data.mp4 import write_mp4
 from vilp_data.plots import frame_psnr
 from vilp_data.shards import write_atomic
 from vilp_data.spec import WindowSpec
 from vilp_data.types import F16, F32, F64, U8
 from vilp_data.viewer.canvas import draw_clip
 from vilp_models.imagined import Decoder, Imagination, decode_frames, read_recorded, recorded_starts, spread
-from vilp_models.video import write_mp4
 
 PANEL_HEIGHT = 192
 """Pixels: small images are enlarged to about this in a video."""

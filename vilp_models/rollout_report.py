@@ -18,6 +18,7 @@ import torch
 
 from vilp_data.decode import decode_image
 from vilp_data.errors import UsageError
+from vilp_data.mp4 import write_mp4
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import U8
@@ -27,7 +28,6 @@ from vilp_models.report_files import counted, estimate_table, estimate_words, ma
 from vilp_models.rollout import EpisodeResult, LogPlan, Progress, Timing, roll_out
 from vilp_models.rollout_folder import VIDEOS, find_rollout, new_rollout
 from vilp_models.starts import Start
-from vilp_models.video import write_mp4
 
 VIDEO_SIDE = 384
 """Pixels that the shorter side of a video has at least."""

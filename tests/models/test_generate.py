@@ -11,8 +11,8 @@ import pytest
 from tests.models.conftest import VIEWS
 from tests.models.encoded_cards import DECODERS, ENCODER, WINDOW, futures, write_card_latents
 from tests.models.fake_planner import FakePlanner
-from tests.models.test_video import read_mp4
 from tests.synthetic import psnr
+from tests.test_mp4 import read_mp4
 from tests.test_viewer import column, entities, raw_frames
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError

@@ -59,6 +59,7 @@ def test_starts_are_called_as_they_were_typed(root: Path) -> None:
         (("--denoising-steps", "1", "--sampler", "ddim"), "vilp-cpu-1step-ddim-0-2"),
         (("--precision", "bf16"), "vilp-cpu-bf16-0-2"),
         (("--vqgan", "runs/vqgan-other"), "vilp-cpu-vqgan-other-0-2"),
+        (("--set", "small", "--denoising-steps", "8"), "vilp-cpu-small-8steps-0-2"),
     ],
 )
 def test_each_setting_has_a_folder_of_its_own(
@@ -66,6 +67,13 @@ def test_each_setting_has_a_folder_of_its_own(
 ) -> None:
     rolled_out(root, "--policy", "vilp", "--preset", "cpu", "--seeds", "0:2", *words)
     assert [path.name for path in (root / "rollouts").iterdir()] == [folder]
+
+
+def test_a_policy_that_learns_from_nothing_has_no_action_set(root: Path) -> None:
+    words = ("rollout", "--data", str(root), "--policy", "stay", "--set", "small", "--seeds", "0:2")
+    refused = CliRunner().invoke(app, words).exception
+    assert isinstance(refused, UsageError)
+    assert "'stay' learns from nothing\n   found: --set small" in str(refused)
 
 
 def test_settings_reach_the_policy(root: Path, requests: list[PolicyRequest]) -> None:

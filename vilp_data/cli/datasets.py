@@ -115,15 +115,16 @@ def why_stale(
     preset: PresetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Name the field that makes stored episodes or latents stale.
+    """Name the field that makes stored episodes, latents or generated episodes stale.
 
     Example: vilp-data why-stale data/hanoi --task hanoi
     """
+    from vilp_data.generated_episode import stale_generated
     from vilp_data.staleness import stale_episodes, stale_latents
 
     root, spec = open_dataset(dataset)
     spec = load_task(task, preset=preset) if task else spec
-    reasons = stale_episodes(root, spec) | stale_latents(root, spec)
+    reasons = stale_episodes(root, spec) | stale_latents(root, spec) | stale_generated(root)
     if as_json:
         print_json(reasons)
     else:

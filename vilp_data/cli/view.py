@@ -15,7 +15,13 @@ from vilp_data.spec import TaskSpec, load_task
 
 
 def view(
-    target: Annotated[str, typer.Argument(help="A log, or the id of an ingested episode.", show_default=False)],
+    target: Annotated[
+        str | None,
+        typer.Argument(
+            help="A log, or the id of an ingested episode; with --generated of a generated one. Default: the first of these.",
+            show_default=False,
+        ),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(help="The dataset of an ingested episode. Default: as for the other verbs.", show_default=False),
@@ -34,11 +40,22 @@ def view(
     task: Annotated[
         str | None, typer.Option(help="The task of a log: its commands are plotted first.", show_default=False)
     ] = None,
+    generated: Annotated[
+        str | None,
+        typer.Option(
+            help="Show what VILP imagined along an episode: a folder of DATA/generated, by `vilp-models generate --whole`.",
+            show_default=False,
+        ),
+    ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve a page on 127.0.0.1 until Ctrl-C.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).", show_default=False)] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).", show_default=False)] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="With --generated: write one self-contained page with playable clips.", show_default=False),
+    ] = None,
 ) -> None:
-    """Show a log, or an ingested episode beside its reconstruction, in Rerun.
+    """Show a log, or an ingested episode beside its reconstruction, or what was imagined beside what happened, in Rerun.
 
     Example: vilp-data view episode.mcap --screenshot v.png
     """
@@ -46,6 +63,14 @@ def view(
 
     from vilp_data.viewer import draw_episode, draw_log, present
 
+    if generated is not None:
+        _view_generated(generated, target, data, web=web, save=save, screenshot=screenshot, html=html)
+        return
+    if html is not None:
+        raise UsageError("--html is a page of what was imagined", remedy="name its folder with --generated")
+    if target is None:
+        remedy = "give a log, the id of an ingested episode, or --generated RUN"
+        raise UsageError("nothing was named to look at", remedy=remedy)
     if Path(target).exists():
         named = load_task(task) if task else None
         rate_hz = named.rate_hz if named and named.rate_hz else 10.0
@@ -55,6 +80,37 @@ def view(
         encoders = _encoders_of(root, spec, encoder, run)
         draw = partial(draw_episode, EpisodeStore(root), target, encoders=encoders)
     present(draw, web=web, save=save, screenshot=screenshot, say=print)
+
+
+def _view_generated(
+    run: str,
+    episode_id: str | None,
+    data: Path | None,
+    *,
+    web: bool,
+    save: Path | None,
+    screenshot: Path | None,
+    html: Path | None,
+) -> None:
+    from functools import partial
+
+    from vilp_data.generated_episode import find_generated, generated_ids, open_generated_episode
+    from vilp_data.viewer import present
+    from vilp_data.viewer.generated import draw_generated
+    from vilp_data.viewer.generated_page import write_generated_page
+
+    root, _ = open_dataset(data)
+    store, folder = EpisodeStore(root), find_generated(root, run)
+    ids = generated_ids(folder)
+    if episode_id is None and len(ids) > 1:
+        print(f"{folder}: {len(ids)} episodes, showing {ids[0]}; name another to see it")
+    opened = open_generated_episode(store, folder, episode_id or ids[0])
+    if html is not None:
+        write_generated_page(html, store, opened)
+        print(f"wrote {html} ({html.stat().st_size / 1e6:.1f} MB); it opens in any browser")
+    if html is None or web or save or screenshot:
+        draw = partial(draw_generated, store, opened)
+        present(draw, web=web, save=save, screenshot=screenshot, say=print)
 
 
 def _dataset_with(episode_id: str, data: Path | None) -> tuple[Path, TaskSpec]:

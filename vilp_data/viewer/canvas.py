@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +18,19 @@ from vilp_data import shards
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.plots import Plot
 from vilp_data.types import F64, I64, U8
+from vilp_data.viewer.rrd_pieces import RrdPieces
 
 APPLICATION = "vilp"
 TIMELINE = "log_time"
 FLUSH_BYTES = 8 << 20  # image bytes held back before they are sent together
+SPILL_BYTES = 32 << 20  # image bytes kept in memory before they go to a file
 MAX_LEGEND = 9  # a longer legend would cover its plot
 MAX_PANELS = 4  # plots side by side; the rest are tabs of the last
 MAX_TABS = 8
 LINE_WIDTH = 1.5
+FAINT = 0.5  # of a line's brightness, where another of its colour matters more
+MARK = (235, 235, 235)
+MARK_SIZE = 2.5
 COLOURS = np.array(
     [
         *([255, 107, 107], [79, 195, 108], [91, 157, 255], [255, 200, 87], [197, 139, 255]),
@@ -55,9 +60,11 @@ class Drawn:
 
 
 class Canvas:
-    """An .rrd file in the making. Times are nanoseconds; images are RGB, top row first."""
+    """An .rrd file in the making. Times are nanoseconds; images are RGB, top row first.
 
-    def __init__(self, *, wall_clock: bool) -> None:
+    Images beyond SPILL_BYTES wait in a file without a name in `folder`."""
+
+    def __init__(self, *, wall_clock: bool, folder: Path) -> None:
         self.id = uuid.uuid4().hex
         self._recording = rr.RecordingStream(APPLICATION, recording_id=self.id, send_properties=False)
         # Into memory, not to a file: Rerun's own file sink may hang on a full disk.
@@ -65,6 +72,8 @@ class Canvas:
         self._wall_clock = wall_clock
         self._held: dict[str, list[tuple[int, bytes, str]]] = {}
         self._held_bytes = 0
+        self._sent_bytes = 0
+        self._pieces = RrdPieces(folder)
 
     def moment(self, time_ns: int) -> Moment:
         """How Rerun's calls are told a time: a date on a wall clock, else a duration since zero."""
@@ -83,6 +92,7 @@ class Canvas:
         """One image of distances, as a PNG of 16 bits, so many of whose units make a metre."""
         self._recording.set_time(TIMELINE, **self.moment(time_ns))
         self._recording.log(entity, rr.EncodedDepthImage(blob=png, media_type="image/png", meter=units_a_metre))
+        self._sent(len(png))
 
     def frames(self, entity: str, frames: U8, times_ns: I64) -> None:
         """uint8 [n,H,W,3] RGB, or [n,H,W,1] grey, at int64 [n]."""
@@ -92,12 +102,12 @@ class Canvas:
         self._recording.log(entity, rr.Image.from_fields(format=form), static=True)
         columns = rr.Image.columns(buffer=frames.reshape(len(frames), -1))
         self._recording.send_columns(entity, indexes=[self._index(times_ns)], columns=columns)
+        self._sent(frames.nbytes)
 
-    def plots(self, plots: Iterator[Plot]) -> None:
+    def plots(self, plots: Iterable[Plot]) -> None:
         for plot in plots:
-            colours = COLOURS[np.arange(len(plot.names)) % len(COLOURS)]
-            lines = rr.SeriesLines(names=plot.names, colors=colours, widths=LINE_WIDTH)
-            self._recording.log(plot.entity, lines, static=True)
+            self.plots(plot.over)
+            self._recording.log(plot.entity, _series(plot), static=True)
             times = self._index(np.array(plot.times_ns, np.int64))
             columns = rr.Scalars.columns(scalars=plot.table())
             self._recording.send_columns(plot.entity, indexes=[times], columns=columns)
@@ -122,21 +132,34 @@ class Canvas:
         )
         self._recording.send_blueprint(blueprint)
 
-    def data(self) -> bytes:
-        """All that was drawn, as an .rrd file's bytes. Read once: each reading ends with an index of the file."""
+    def blocks(self) -> Iterator[bytes]:
+        """All that was drawn, as an .rrd file's bytes. Read once."""
         self._send_held()
-        return self._stream.read() or b""
+        if not self._pieces.any:
+            yield self._stream.read() or b""
+            return
+        self._pieces.add(self._stream.read() or b"")
+        yield from self._pieces.blocks()
 
     def close(self) -> None:
         self._recording.disconnect()
+        self._pieces.close()
 
     def _send_held(self) -> None:
         for entity, images in self._held.items():
             times = self._index(np.array([image[0] for image in images], np.int64))
             columns = rr.EncodedImage.columns(blob=[i[1] for i in images], media_type=[i[2] for i in images])
             self._recording.send_columns(entity, indexes=[times], columns=columns)
+        sent, self._held_bytes = self._held_bytes, 0
         self._held.clear()
-        self._held_bytes = 0
+        self._sent(sent)
+
+    def _sent(self, n_bytes: int) -> None:
+        """So many more bytes of images are in the stream's memory."""
+        self._sent_bytes += n_bytes
+        if self._sent_bytes > SPILL_BYTES:
+            self._sent_bytes = 0
+            self._pieces.add(self._stream.read() or b"")
 
     def _whole_time(self, times_ns: list[int]) -> rrb.TimeAxis | None:
         """A time axis over all that was drawn, the same for all plots."""
@@ -160,10 +183,12 @@ def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
         raise UsageError("no such folder", where=rrd.parent, remedy="make it, or save somewhere else")
     if rrd.is_dir():
         raise StoreError("a folder is in the way", where=rrd, remedy="save under another name")
-    canvas = Canvas(wall_clock=wall_clock)
+    canvas = Canvas(wall_clock=wall_clock, folder=rrd.parent)
     try:
         yield canvas
-        shards.write_atomic(rrd, canvas.data())
+        with shards.atomic_file(rrd) as file:
+            for block in canvas.blocks():
+                file.write(block)
     finally:
         canvas.close()
 
@@ -200,14 +225,29 @@ def title_of(topic: str, group: str = "") -> str:
     return f"{topic.strip('/')} {last}".strip()
 
 
+def _n_series(plot: Plot) -> int:
+    return len(plot.names) + sum(map(_n_series, plot.over))
+
+
+def _series(plot: Plot) -> Any:
+    colours = COLOURS[np.arange(len(plot.names)) % len(COLOURS)]
+    if plot.style == "points":
+        return rr.SeriesPoints(
+            names=plot.names, colors=[MARK] * len(plot.names), markers="diamond", marker_sizes=MARK_SIZE
+        )
+    if plot.style == "faint":
+        colours = (colours * FAINT).astype(np.uint8)
+    return rr.SeriesLines(names=plot.names, colors=colours, widths=LINE_WIDTH)
+
+
 def _panel(plots: Sequence[Plot], axis: rrb.TimeAxis | None) -> Any:
     views = [
         rrb.TimeSeriesView(
             origin=plot.entity,
-            contents=f"{plot.entity}",
+            contents=[plot.entity, *(other.entity for other in plot.over)],
             name=plot.title,
             axis_x=axis,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=1 < len(plot.names) <= MAX_LEGEND),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=1 < _n_series(plot) <= MAX_LEGEND),
         )
         for plot in plots[:MAX_TABS]
     ]

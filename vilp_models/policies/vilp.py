@@ -14,18 +14,32 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from vilp_data.errors import UsageError
-from vilp_data.types import F32
+from vilp_data.types import F32, U8
 from vilp_models.low_level import LowLevelPolicy
 from vilp_models.planner import Planner, Sampler
 from vilp_models.policies.base import Observation
 from vilp_models.recipe import Precision
 from vilp_models.vqgan import VqganEncoder
+
+
+@dataclass(frozen=True)
+class Plan:
+    """actions  float32 [B,n_action_steps,A]
+    latents  view -> [B,N,c,h,w], imagined, before quantisation
+    films    view -> uint8 [B,1+P,H,W,C], the observation and the imagined frames that the actions lead to; empty for a low-level
+             policy that sees latents
+    """
+
+    actions: F32
+    latents: Mapping[str, Tensor]
+    films: Mapping[str, Tensor]
 
 
 class VilpPolicy:
@@ -92,9 +106,13 @@ class VilpPolicy:
     def timings(self) -> Mapping[str, float]:
         return dict(self._timings)
 
-    @torch.inference_mode()
     def act(self, observation: Observation) -> F32:
         """Plan, and give the actions that lead to the planned frames: float32 [B, n_action_steps, A]."""
+        return self.plan(observation).actions
+
+    @torch.inference_mode()
+    def plan(self, observation: Observation) -> Plan:
+        """What `act` imagines and would do."""
         self._timings = {}
         frames = {view: torch.as_tensor(observation.frames[view]).to(self.device) for view in self.planners}
         low_dim = torch.as_tensor(observation.low_dim).to(self.device)
@@ -103,15 +121,26 @@ class VilpPolicy:
             with self._timed("encode"):  # rounded as the latents that were trained on
                 present = {v: self.encoders[v].encode_tensor(images).half() for v, images in frames.items()}
         imagined = self._imagine(frames, present, low_dim)
+        films: dict[str, Tensor] = {}
         if self._sees_latents:
-            film = {view: torch.cat([present[view][:, None].float(), clip], dim=1) for view, clip in imagined.items()}
+            seen = {view: torch.cat([present[view][:, None].float(), clip], dim=1) for view, clip in imagined.items()}
         else:
             with self._timed("decode"), self._autocast():
-                film = {view: self._decoded(view, frames[view], clip) for view, clip in imagined.items()}
+                films = {view: self._decoded(view, frames[view], clip) for view, clip in imagined.items()}
+            seen = films
         with self._timed("act"), self._autocast():
-            actions = self._actions(film, low_dim).cpu().numpy()
+            actions = self._actions(seen, low_dim).cpu().numpy()
         self._n_plans += 1
-        return actions
+        return Plan(actions, imagined, films)
+
+    @torch.inference_mode()
+    def imagined_frames(self, plan: Plan) -> dict[str, U8]:
+        """view -> uint8 [B,P,H,W,C]: the imagined frames that a plan's actions lead to."""
+        frames = {view: film[:, 1:] for view, film in plan.films.items()}
+        for view, clip in plan.latents.items() if not frames else ():
+            images = self.encoders[view].decode_tensor(clip[:, : self.n_pairs].flatten(0, 1))
+            frames[view] = images.view(len(clip), self.n_pairs, *images.shape[1:])
+        return {view: images.cpu().numpy() for view, images in frames.items()}
 
     def _imagine(
         self, frames: Mapping[str, Tensor], present: Mapping[str, Tensor], low_dim: Tensor

@@ -12,8 +12,8 @@ from av.video.reformatter import ColorRange, Colorspace
 
 from tests.synthetic import card_frame, colour_card, psnr
 from vilp_data.errors import StoreError, UsageError
+from vilp_data.mp4 import write_mp4
 from vilp_data.types import U8
-from vilp_models.video import write_mp4
 
 CLOSE_DB = (
     32.0  # H.264 at 4:2:0 keeps the card above this; another matrix, range or channel order, a flip or a shift is below
@@ -90,7 +90,7 @@ def test_a_video_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     def full(frame: U8) -> av.VideoFrame:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("vilp_models.video._yuv", full)
+    monkeypatch.setattr("vilp_data.mp4._yuv", full)
     with pytest.raises(StoreError, match="No space left"):
         write_mp4(tmp_path / "a.mp4", colour_card()[None], fps=10)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]

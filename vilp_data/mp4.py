@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 
 import av
@@ -17,23 +19,26 @@ CRF = "16"
 """x264's constant rate factor: the eye sees no difference, and a 96x96 episode of 30 s is well under 1 MB."""
 
 
-def write_mp4(path: Path, frames: U8, *, fps: float, scale: int = 1) -> None:
-    """Write RGB frames uint8 [n,H,W,3] to `path`, whole or not at all, each pixel enlarged to scale x scale.
+def write_mp4(path: Path, frames: Iterable[U8], *, fps: float, scale: int = 1) -> None:
+    """Write RGB frames, uint8 [H,W,3] each, to `path`, whole or not at all, each pixel enlarged to scale x scale. They are taken one by
+    one: a generator of them may be longer than the memory.
 
     H.264 at 4:2:0 needs even sides: an odd one is filled up with its last row or column. Raises UsageError where there is no
     frame, StoreError where the file cannot be written."""
-    if not len(frames):
+    rest = iter(frames)
+    start = next(rest, None)
+    if start is None:
         raise UsageError("no frames to make a video of", where=path)
     with atomic_file(path) as file, av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options={"crf": CRF})
-        first = enlarged(frames[0], scale)
+        first = enlarged(start, scale)
         stream.height, stream.width, stream.pix_fmt = *first.shape[:2], "yuv420p"
         # Without tags a player guesses the matrix from the size, and small videos turn out a little too green.
         stream.codec_context.colorspace = Colorspace.ITU709.value
         stream.codec_context.color_primaries = ColorPrimaries.BT709.value
         stream.codec_context.color_trc = ColorTrc.BT709.value
         stream.codec_context.color_range = ColorRange.MPEG.value
-        for frame in frames:
+        for frame in chain([start], rest):
             container.mux(stream.encode(_yuv(enlarged(frame, scale))))
         container.mux(stream.encode())
 
