@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 
 import cv2
@@ -60,6 +61,14 @@ def grid(rows: Mapping[str, Sequence[U8 | None]], columns: Sequence[str], *, sca
 def to_png(image: U8) -> bytes:
     """Encode RGB uint8 [H,W,3]."""
     return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+
+
+def jpeg_uri(image: U8, *, quality: int) -> str:
+    """An image uint8 [H,W,3] RGB, or [H,W,1], as a JPEG in the page itself. `quality` 0 … 100."""
+    pixels = image[..., ::-1] if image.shape[2] == 3 else image
+    done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done, "a uint8 image can always be encoded"
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
 def _text(text: str, height: int, width: int) -> U8:

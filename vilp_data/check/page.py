@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import re
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
-
-import cv2
 
 from vilp_data import shards
 from vilp_data.check.findings import SEVERITIES, Finding, Group, counts, grouped, verdict
@@ -18,8 +15,8 @@ from vilp_data.check.sources import CheckReport
 from vilp_data.check.style import STYLE
 from vilp_data.check.svg import fit_bars, lag_line, lane
 from vilp_data.check.text import duration, said_of, shown_evidence, where
+from vilp_data.contact_sheet import jpeg_uri
 from vilp_data.errors import UsageError
-from vilp_data.types import U8
 
 JPEG_QUALITY = 82
 SHOWN_PLACES = 40
@@ -51,9 +48,9 @@ def page(report: CheckReport) -> str:
     one = len(report.checked) == 1
     title = Path(report.checked[0].source).name if one else f"{report.folder or 'check'} ({len(report.checked)} logs)"
     body = [
-        f"<header><h1>{escape(title)}</h1>{_lead(report)}{_tally(findings)}</header>",
+        f"<header><h1>{escape(title)}</h1>{_lead(report)}{tally(findings)}</header>",
         _section(
-            "Findings", _shorter(report, "".join(_group(group, with_source=not one) for group in grouped(findings)))
+            "Findings", _shorter(report, "".join(article(group, with_source=not one) for group in grouped(findings)))
         ),
         _section("Does the action drive the motion?", _fits(report.fits)),
         _section("What was checked" if one else "Each of them", "".join(_sources(report))),
@@ -87,7 +84,8 @@ def _lead(report: CheckReport) -> str:
     return f'<p class="soft">{escape(told)}</p>{source}'
 
 
-def _tally(findings: Sequence[Finding]) -> str:
+def tally(findings: Sequence[Finding]) -> str:
+    """How many of each severity, as a list of large numbers."""
     numbers = counts(findings)
     if not findings:
         return '<ul class="tally"><li class="good"><b>&#10003;</b>nothing to complain about</li></ul>'
@@ -102,7 +100,8 @@ def _tally(findings: Sequence[Finding]) -> str:
 # --- findings -----------------------------------------------------------------------------------------------------------
 
 
-def _group(group: Group, *, with_source: bool) -> str:
+def article(group: Group, *, with_source: bool) -> str:
+    """Findings of one kind: the first in full, the places of the others folded away."""
     first = group.first
     evidence = "".join(
         f"<li>{escape(name.replace('_', ' '))} <b>{escape(value)}</b></li>"
@@ -114,7 +113,7 @@ def _group(group: Group, *, with_source: bool) -> str:
         f'<span class="mono">{escape(where(first, with_source=with_source))}</span>{times}</div>'
         f'<p class="what">{escape(first.what)}</p>'
         + (f'<ul class="evidence">{evidence}</ul>' if evidence else "")
-        + (f'<p class="remedy">{_with_code(first.remedy)}</p>' if first.remedy else "")
+        + (f'<p class="remedy">{with_code(first.remedy)}</p>' if first.remedy else "")
         + _others(group.others, with_source=with_source)
         + "</article>"
     )
@@ -132,7 +131,7 @@ def _others(others: Sequence[Finding], *, with_source: bool) -> str:
     return f'<details class="more"><summary>{told}</summary><ul>{items}{rest}</ul></details>'
 
 
-def _with_code(text: str) -> str:
+def with_code(text: str) -> str:
     """Text whose `commands` and lines of TOML are set as code."""
     escaped = escape(text, quote=False)
     escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped)
@@ -224,15 +223,8 @@ def _facts(topic: TopicFacts) -> Iterator[str]:
 def _sheet(sheet: Sheet, n_pictures: int) -> str:
     every = max(-(-len(sheet.pictures) // n_pictures), 1)
     figures = "".join(
-        f'<figure><img alt="{escape(label)}" loading="lazy" src="{_data_uri(picture)}"><figcaption>{escape(label)}</figcaption></figure>'
+        f'<figure><img alt="{escape(label)}" loading="lazy" src="{jpeg_uri(picture, quality=JPEG_QUALITY)}">'
+        f"<figcaption>{escape(label)}</figcaption></figure>"
         for label, picture in sheet.pictures[::every]
     )
     return f'<h3 class="mono">{escape(sheet.topic)}</h3><div class="sheet">{figures}</div>'
-
-
-def _data_uri(picture: U8) -> str:
-    """A picture uint8 [h,w,C] as a JPEG in the page itself."""
-    pixels = picture[..., ::-1] if picture.shape[2] == 3 else picture
-    done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    assert done, "a small uint8 picture can always be encoded"
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
-from vilp_data.cli.options import open_dataset
+from vilp_data.cli.options import open_dataset, progress_bar
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.latents import FrameEncoder, load_encoder
+from vilp_data.locate import is_dataset
 from vilp_data.spec import TaskSpec, load_task
 
 
@@ -18,7 +19,8 @@ def view(
     target: Annotated[
         str | None,
         typer.Argument(
-            help="A log, or the id of an ingested episode; with --generated of a generated one. Default: the first of these.",
+            help="A log, the id of an ingested episode, or with --html a dataset folder; with --generated the id of a generated one."
+            " Default: the first of these.",
             show_default=False,
         ),
     ] = None,
@@ -32,7 +34,10 @@ def view(
     ] = None,
     run: Annotated[
         Path | None,
-        typer.Option(help="The frame encoder to reconstruct with. Default: the only run there is.", show_default=False),
+        typer.Option(
+            help="The frame encoder to reconstruct with; of a dataset's page, whose fidelity to show. Default: the only run there is.",
+            show_default=False,
+        ),
     ] = None,
     encoder: Annotated[
         str, typer.Option(help="Kind of frame encoder, as registered under vilp.frame_encoders.")
@@ -52,10 +57,14 @@ def view(
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).", show_default=False)] = None,
     html: Annotated[
         Path | None,
-        typer.Option(help="With --generated: write one self-contained page with playable clips.", show_default=False),
+        typer.Option(
+            help="Write one self-contained page: of a dataset, its episodes to look through; with --generated, playable clips.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
-    """Show a log, or an ingested episode beside its reconstruction, or what was imagined beside what happened, in Rerun.
+    """Show a log, or an ingested episode beside its reconstruction, or what was imagined beside what happened, in Rerun; or a whole
+    dataset as a page.
 
     Example: vilp-data view episode.mcap --screenshot v.png
     """
@@ -66,10 +75,17 @@ def view(
     if generated is not None:
         _view_generated(generated, target, data, web=web, save=save, screenshot=screenshot, html=html)
         return
+    dataset = _dataset_named(target, data, html)
+    if dataset is not None:
+        _view_dataset(dataset, run, html, in_rerun=web or save is not None or screenshot is not None)
+        return
     if html is not None:
-        raise UsageError("--html is a page of what was imagined", remedy="name its folder with --generated")
+        remedy = (
+            "name a dataset folder, or with --generated what was imagined; --web and --save show a log or an episode"
+        )
+        raise UsageError("--html is a page of a dataset, or of what was imagined", where=target, remedy=remedy)
     if target is None:
-        remedy = "give a log, the id of an ingested episode, or --generated RUN"
+        remedy = "give a log, the id of an ingested episode, a dataset with --html PAGE.html, or --generated RUN"
         raise UsageError("nothing was named to look at", remedy=remedy)
     if Path(target).exists():
         named = load_task(task) if task else None
@@ -80,6 +96,37 @@ def view(
         encoders = _encoders_of(root, spec, encoder, run)
         draw = partial(draw_episode, EpisodeStore(root), target, encoders=encoders)
     present(draw, web=web, save=save, screenshot=screenshot, say=print)
+
+
+def _dataset_named(target: str | None, data: Path | None, html: Path | None) -> Path | None:
+    """The dataset whose page is asked for: the target where it is a dataset folder, and without a target the one of the other verbs."""
+    if target is not None:
+        return Path(target) if is_dataset(Path(target)) else None
+    return open_dataset(data)[0] if html is not None else None
+
+
+def _view_dataset(root: Path, run: Path | None, html: Path | None, *, in_rerun: bool) -> None:
+    from vilp_data.check.page import require_place
+    from vilp_data.latent_runs import find_run
+    from vilp_data.viewer.dataset_facts import dataset_facts
+    from vilp_data.viewer.dataset_page import write_dataset_page
+
+    if html is None or in_rerun:
+        remedy = f"`vilp-data view {root} --html PAGE.html`; for one episode in Rerun `vilp-data view ID --data {root}`"
+        raise UsageError(
+            "a dataset is shown as a page; --web, --save and --screenshot show one episode", where=root, remedy=remedy
+        )
+    require_place(html)
+    if run is not None:
+        run = find_run(root, run, "vqgan")
+    with progress_bar("checking", None):
+        facts = dataset_facts(root, run=run)
+    with progress_bar("drawing", len(facts.entries)) as advance:
+        form = write_dataset_page(html, facts, progress=advance)
+    told = (
+        f"{len(facts.entries)} episodes, up to {form.n_frames} frames of each view" if facts.entries else "no episodes"
+    )
+    print(f"wrote {html} ({html.stat().st_size / 1e6:.1f} MB): {told}; it opens in any browser")
 
 
 def _view_generated(

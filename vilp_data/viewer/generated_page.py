@@ -10,12 +10,11 @@ from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from vilp_data import shards
 from vilp_data.check.style import STYLE as PAGE_STYLE
-from vilp_data.contact_sheet import ERROR_GAIN, as_rgb
+from vilp_data.contact_sheet import ERROR_GAIN, as_rgb, jpeg_uri
 from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.generated_episode import KINDS, GeneratedEpisode, shown_frames
@@ -32,6 +31,8 @@ PANEL_HEIGHT = 192
 
 KIND_HEADS = ["recon\u00adstructed", "imagined"]
 """KINDS over narrow columns: the first may be hyphenated."""
+
+POSTER_QUALITY = 95
 
 BLOCK_BYTES = 3 << 20
 """Of a clip, turned into text at a time; a multiple of three."""
@@ -187,8 +188,8 @@ def _figure(view: str, clip: _Clip) -> Iterator[str]:
         for kind, name in zip(("real", *KINDS, "error"), PANELS, strict=True)
     )
     yield f'<div class="clip"><h3>{escape(view)}</h3><div class="names">{names}</div><div class="panels">{panels}</div>'
-    poster = base64.b64encode(cv2.imencode(".jpg", clip.poster[..., ::-1])[1].tobytes()).decode()
-    yield f'<video controls loop muted playsinline preload="auto" poster="data:image/jpeg;base64,{poster}" src="data:video/mp4;base64,'
+    poster = jpeg_uri(clip.poster, quality=POSTER_QUALITY)
+    yield f'<video controls loop muted playsinline preload="auto" poster="{poster}" src="data:video/mp4;base64,'
     with clip.path.open("rb") as file:
         while block := file.read(BLOCK_BYTES):
             yield base64.b64encode(block).decode()
