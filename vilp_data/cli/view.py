@@ -11,6 +11,7 @@ from vilp_data.cli.options import open_dataset
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.latents import FrameEncoder, load_encoder
+from vilp_data.locate import a_dataset, is_dataset
 from vilp_data.spec import TaskSpec, load_task
 
 
@@ -22,7 +23,9 @@ def view(
     ] = None,
     episode: Annotated[
         str | None,
-        typer.Option(help="Which demonstration of a log that holds many. Default: the first.", show_default=False),
+        typer.Option(
+            help="Which demonstration of a log that holds many. Default: the first whole one.", show_default=False
+        ),
     ] = None,
     run: Annotated[
         Path | None,
@@ -46,6 +49,8 @@ def view(
 
     from vilp_data.viewer import draw_episode, draw_log, present
 
+    if is_dataset(Path(target)):
+        raise a_dataset(Path(target))
     if Path(target).exists():
         named = load_task(task) if task else None
         rate_hz = named.rate_hz if named and named.rate_hz else 10.0

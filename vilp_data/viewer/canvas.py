@@ -164,6 +164,9 @@ def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
     try:
         yield canvas
         shards.write_atomic(rrd, canvas.data())
+    except BaseException:
+        canvas.data()  # what nobody has read when it closes, Rerun complains of on the terminal
+        raise
     finally:
         canvas.close()
 
