@@ -83,6 +83,13 @@ def plain_dataset(root: Path) -> list[Episode]:
     return episodes
 
 
+def blind_dataset(root: Path) -> list[Episode]:
+    """Two episodes of a robot without any camera: numbers alone."""
+    episodes = [replace(demonstration(name, 6 + len(name)), frames={}, source_index={}) for name in ("pick", "place")]
+    write(root, *episodes, spec={**SPEC, "views": {}})
+    return episodes
+
+
 def shown(one: Episode, view: str) -> Any:
     """What each step sees, uint8 [F,H,W,3]."""
     return one.frames[view][one.source_index[view]]

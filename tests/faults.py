@@ -69,6 +69,20 @@ def _call_dying(nth: int, names: Sequence[str], function: Callable[..., None], a
     function(*arguments)
 
 
+def kill_after(count: int, patch: pytest.MonkeyPatch) -> None:
+    """End an ingest in this process, as Ctrl-C does, once it has dealt with `count` demonstrations."""
+    from vilp_data import ingest
+
+    whole, done = ingest._ingest_one, iter(range(count))
+
+    def dying(*arguments: Any) -> Any:
+        if next(done, None) is None:
+            raise KeyboardInterrupt
+        return whole(*arguments)
+
+    patch.setattr(ingest, "_ingest_one", dying)
+
+
 def run_until_files(code: str, arguments: list[str], *, folder: Path, count: int) -> bool:
     """Run Python code in a process that is killed once `count` files lie below `folder`; False where it ended before that.
 

@@ -15,6 +15,7 @@ from tests.followers import follower
 from tests.pusht_human import human_episode
 from vilp_data.check.action import action_findings
 from vilp_data.check.action_fit import SHIFTS, Trajectory, fit_action
+from vilp_data.check.text import said_of
 
 
 def trajectories(
@@ -38,6 +39,17 @@ def test_actions_shifted_by_s_are_found_as_s(shift: int, seed: int, follow: floa
     assert fit.gain[shift] > 0.7
     found = [finding.kind for finding in action_findings(fit, topic="/action", rate_hz=10.0, certain=True)]
     assert found == {1: ["action-late"], 0: [], -1: ["action-early"]}[int(np.sign(shift))]
+
+
+def test_what_is_said_of_early_actions_does_not_call_one_shift_the_best() -> None:
+    """Of slow robots an action alone may explain more the earlier it is; what tells the shift is what later ones add."""
+    fit = fit_action(trajectories(-2))
+    assert fit is not None
+    slow = replace(fit, gain={**fit.gain, -3: 0.9, -2: 0.7})
+    (found,) = action_findings(slow, topic="/action", rate_hz=30.0, certain=True)
+    assert "best" not in found.what
+    assert f"up to that of step k-2: together they explain {slow.up_to[-2]:.0%}" in found.what
+    assert "add nothing to the earlier ones" in said_of(slow)
 
 
 def verdicts(found: list[Trajectory], *, rate_hz: float = 10.0) -> list[tuple[str, str]]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.faulty_logs import CAMERA, write_faulty
+from tests.lerobot_folders import write_v21
 from tests.real_data import real_data
 from tests.synthetic import ACTION_TOPIC, JOINT_TOPIC, Encoding, write_mcap, write_zarr
-from vilp_data.check.findings import Finding
+from vilp_data.check.findings import Finding, grouped
 from vilp_data.check.log import check_log
 from vilp_data.check.report import BINS
 from vilp_data.check.sources import check_sources
@@ -181,7 +183,34 @@ def test_logs_of_people_and_robots_raise_no_false_alarm() -> None:
     assert report.fits[0].fit.best == 0
 
 
+def robot_folder(path: Path, *, missing: Sequence[int]) -> Path:
+    """A LeRobot dataset of 30 short episodes, of which those are without video, and the last one without its table."""
+    folder = write_v21(path, lengths=[5] * 30)
+    for episode in missing:
+        folder.video(episode).unlink()
+    folder.table(29).unlink()
+    return path
+
+
+def test_pictures_are_of_the_episodes_that_are_whole_and_each_cause_is_told_by_itself(tmp_path: Path) -> None:
+    path = robot_folder(tmp_path / "robot", missing=[k for k in range(29) if k not in (7, 20)])
+    (checked,) = (report := check_sources([path])).checked
+    (sheet,) = checked.sheets
+    assert {label.split(",")[0] for label, _ in sheet.pictures} == {"episode_000007", "episode_000020"}
+    assert {topic.name: topic.n_messages for topic in checked.topics if topic.timing}["action"] == 10
+    titles = [group.first.what for group in grouped(report.findings) if group.first.kind == "damaged"]
+    assert sorted(titles) == ["the episode's table is missing", "the video is missing"]
+
+
+def test_with_a_task_only_the_topics_that_it_reads_are_judged(tmp_path: Path) -> None:
+    log = write_faulty(tmp_path / "bad.mcap", black=(3.0, 6.0), gap=(8.0, 10.0))
+    spec = TaskSpec.model_validate({"name": "t", "rate_hz": 20, "low_dim": {"joints": {"topic": JOINT_TOPIC}}})
+    assert {finding.place.topic for finding in findings_of(log)} == {CAMERA, JOINT_TOPIC}
+    assert {finding.place.topic for finding in findings_of(log, spec=spec)} == {JOINT_TOPIC}
+
+
 def test_the_file_that_git_mangled_is_named() -> None:
     (found,) = findings_of(real_data("logs/keelson/connectors_klog_bin_2024-05-15.mcap"))
     assert "line endings" in found.what
     assert "binary" in str(found.remedy)
+    assert "vilp-data salvage" in str(found.remedy)

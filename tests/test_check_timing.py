@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from vilp_data.check.findings import Finding
 from vilp_data.check.timing import (
-    GAP_FACTOR,
     GAP_FLOOR_S,
     drift_findings,
     log_order_findings,
@@ -18,6 +17,7 @@ from vilp_data.check.timing import (
     silence_findings,
     timing_findings,
 )
+from vilp_data.message_rate import GAP_FACTOR
 
 START_NS = 1_700_000_000_000_000_000
 rates = st.sampled_from([5.0, 10.0, 29.97, 50.0, 200.0])
@@ -48,6 +48,18 @@ def kinds(findings: list[Finding]) -> set[str]:
 def test_a_clean_stream_gives_no_finding(rate_hz: float, n: int, jitter: float, seed: int, with_header: bool) -> None:
     log, header = stream(n, rate_hz, jitter=jitter, seed=seed)
     assert judged(log, header if with_header else None) == []
+
+
+def in_bursts(n_bursts: int, of: int) -> np.ndarray:
+    """Log times of messages half a millisecond apart, a few tens at a time, twice in a second."""
+    return np.concatenate([START_NS + k * 500_000_000 + np.arange(of) * 500_000 for k in range(n_bursts)])
+
+
+def test_what_comes_in_bursts_has_no_gaps_and_no_missing_messages() -> None:
+    log = in_bursts(20, 30)
+    assert judged(log, log - 1_000_000, camera=False) == []
+    assert (measure(log, None).periodic, measure(log, None).rate_hz) == (False, None)
+    assert kinds(judged(log, None)) == {"irregular-camera"}
 
 
 @few

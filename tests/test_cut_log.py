@@ -96,14 +96,25 @@ def test_ingesting_again_does_nothing_and_reads_no_marker_again(
     assert tree(tmp_path / "data") == before
 
 
-def test_other_cuts_are_noticed_and_do_not_mix_with_the_old_ones(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gap_s", [4.5, 1.4], ids=["other cuts", "as it happens the same cuts"])
+def test_another_rule_is_named_and_refused_whatever_it_would_cut(tmp_path: Path, gap_s: float) -> None:
     log, root = write_session(tmp_path / "run.mcap"), tmp_path / "data"
     ingest(log, root, task(GAP))
-    changed = task(GAP | {"gap_s": 4.5})
-    assert "episodes.gap_s: 1.5 -> 4.5" in stale_episodes(root, changed)["run-at-00000.000s"]
-    with pytest.raises(UsageError, match="vilp-data remove"):
+    before, changed = tree(root), task(GAP | {"gap_s": gap_s})
+    stale = stale_episodes(root, changed)["run-at-00000.000s"]
+    assert f"episodes.gap_s: 1.5 -> {gap_s}" in stale
+    assert "--into" in stale
+    with pytest.raises(UsageError, match=rf"another rule\n.*gap_s: 1.5 -> {gap_s}(.|\n)*--into"):
         ingest(log, root, changed)
-    assert len(ingest(log, tmp_path / "other", changed).written) == 1
+    assert tree(root) == before
+    assert ingest(log, tmp_path / "other", changed).written
+
+
+def test_demonstrations_of_whole_logs_and_of_cuts_do_not_mix(tmp_path: Path) -> None:
+    log, root = write_session(tmp_path / "run.mcap"), tmp_path / "data"
+    ingest(log, root, task({"by": "file"}))
+    with pytest.raises(UsageError, match="another rule\n.*episodes: added"):
+        ingest(log, root, task(GAP))
 
 
 def write_task(folder: Path, ranges: str) -> TaskSpec:

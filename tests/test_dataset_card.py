@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.export_datasets import SPEC, demonstration, plain_dataset, write
+from tests.export_datasets import SPEC, blind_dataset, demonstration, plain_dataset, write
 from vilp_data.contact_sheet import captioned, stacked
 from vilp_data.dataset_card import SHEET_EPISODES, make_card, write_card
 from vilp_data.episodes import EpisodeStore
@@ -54,7 +54,7 @@ def test_masked_steps_and_findings_are_told_once_with_counts(tmp_path: Path) -> 
     ]
     write(tmp_path, *episodes)
     told = section(make_card(EpisodeStore(tmp_path)).markdown, "Masked steps and findings")
-    assert "3 steps of 3 episodes are masked" in told
+    assert "Masked: 3 steps of 3 episodes." in told
     assert told.count("see the image of the step before") == 1
     assert "(and the like in 2 more)" in told
 
@@ -76,6 +76,16 @@ def test_the_contact_sheet_shows_episodes_from_first_frame_to_last(tmp_path: Pat
         large = frame.repeat(5, axis=0).repeat(5, axis=1)
         found = cv2.matchTemplate(np.ascontiguousarray(sheet), np.ascontiguousarray(large), cv2.TM_SQDIFF)
         assert found.min() < 1e-6 * 255**2 * large.size  # the matcher rounds
+
+
+def test_a_dataset_without_cameras_has_a_card_without_pictures(tmp_path: Path) -> None:
+    blind_dataset(tmp_path / "data")
+    assert write_card(EpisodeStore(tmp_path / "data"), tmp_path / "card.md") is None
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["card.md"]
+    text = (tmp_path / "card.md").read_text()
+    assert "![" not in text
+    assert "None: numbers alone." in section(text, "Views")
+    assert "| `action[1]`" in section(text, "Numbers")
 
 
 def test_many_episodes_are_shown_by_a_few(tmp_path: Path) -> None:

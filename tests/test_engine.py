@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -137,3 +138,26 @@ def test_a_caller_that_stops_listening_leaves_no_worker(tmp_path: Path) -> None:
     with closing(map_unordered(time.sleep, [0.0, 60.0, 60.0], workers=2)) as results:
         next(results)
     assert not set(multiprocessing.active_children()) - before
+
+
+def wait_with_a_semaphore(folder: str) -> None:
+    """What a library that locks across processes leaves in a worker: numcodecs, when a zarr store is read."""
+    lock = multiprocessing.get_context("spawn").Lock()
+    say_pid_and_wait(folder)
+    del lock
+
+
+def wait_unasked(folder: str) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as in a long call into a library
+    say_pid_and_wait(folder)
+
+
+@pytest.mark.parametrize("function", [wait_with_a_semaphore, wait_unasked])
+def test_ctrl_c_leaves_no_semaphore_and_no_worker(tmp_path: Path, function: Callable[[str], None]) -> None:
+    code = TWO_WORKERS.replace("say_pid_and_wait", function.__name__)
+    parent, pids = start(code, tmp_path, 2)
+    os.killpg(parent.pid, signal.SIGINT)
+    _, error = parent.communicate(timeout=20)
+    assert_all_end(pids)
+    assert "leaked" not in error
+    assert error.count("KeyboardInterrupt") == 1, error

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.export_datasets import SPEC, demonstration, plain_dataset, shown, write
+from tests.export_datasets import SPEC, blind_dataset, demonstration, plain_dataset, shown, write
 from tests.faults import run_until_killed, tree
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import SpecError, SplitError, StoreError, UsageError
@@ -36,11 +36,11 @@ READ: dict[str, tuple[str, str, list[str], str]] = {
 }
 
 
-def ingested_again(folder: Path, to: str, root: Path) -> list[Any]:
+def ingested_again(folder: Path, to: str, root: Path, *, views: Any = SPEC["views"]) -> list[Any]:
     """The export, ingested as any log of its format would be."""
     inside, image, vectors, action = READ[to]
     topic = {"clock": "log"}
-    views = {name: {**table, **topic, "topic": image.format(name)} for name, table in SPEC["views"].items()}
+    views = {name: {**table, **topic, "topic": image.format(name)} for name, table in views.items()}
     low_dim = {f"part{i}": {**topic, "topic": name} for i, name in enumerate(vectors)}
     table = {
         "name": "again",
@@ -110,6 +110,19 @@ def test_what_is_left_out_by_default_is_said_and_can_be_asked_for(tmp_path: Path
     full = export_dataset(tmp_path / "data", tmp_path / "full", "diffusion-policy", choice=choice)
     assert (full.episodes, full.left_out) == (4, {})
     assert "episodes without actions, theirs are NaN: 1" in full.notes
+
+
+@pytest.mark.parametrize("to", ALL)
+def test_a_dataset_without_cameras_is_exported_as_its_numbers(tmp_path: Path, to: str) -> None:
+    episodes = blind_dataset(tmp_path / "data")
+    report = export_dataset(tmp_path / "data", tmp_path / "out", to)
+    assert (report.episodes, report.views) == (2, {})
+    assert not [line for line in report.verified if "frames" in line]
+    assert sorted(path.suffix for path in (tmp_path / "out").rglob("*.png")) == []
+    again = ingested_again(tmp_path / "out", to, tmp_path / "again", views={})
+    for before, after in zip(episodes, again, strict=True):
+        assert np.array_equal(after.low_dim, before.low_dim)
+        assert np.array_equal(after.action, before.action)
 
 
 def test_a_dataset_without_any_actions_is_exported_without(tmp_path: Path) -> None:

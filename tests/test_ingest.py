@@ -7,12 +7,14 @@ import os
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import zarr
 
 from tests import synthetic
-from tests.faults import kill_moments, run_until_files, run_until_killed, tree
+from tests.faults import kill_after, kill_moments, run_until_files, run_until_killed, tree
+from tests.sources.test_hdf5_log import write_hdf5
 from tests.synthetic import task_spec, write_mcap, write_zarr, zarr_task_spec
 from tests.synthetic_bags import write_rosbag1, write_rosbag2
 from vilp_data.episodes import EpisodeStore
@@ -27,6 +29,16 @@ from vilp_data.writer_lock import writer_lock
 
 def ingest(logs: list[Path], root: Path, spec: TaskSpec, *, include_failures: bool = False) -> IngestReport:
     return ingest_logs(logs, root, spec, workers=1, include_failures=include_failures)
+
+
+def test_copies_of_a_log_take_one_line_however_many_there_are(tmp_path: Path) -> None:
+    write_zarr(tmp_path / "a.zarr")
+    for name in "bcdef":
+        shutil.copytree(tmp_path / "a.zarr", tmp_path / f"{name}.zarr")
+    report = ingest([tmp_path], tmp_path / "data", zarr_task_spec())
+    assert len(report.written) == 3
+    (note,) = report.notes
+    assert "and 2 more: 15 copies of what" in note
 
 
 def only_episode(root: Path) -> Episode:
@@ -133,8 +145,11 @@ def test_a_second_run_does_nothing_and_a_changed_spec_says_which_field(tmp_path:
 def test_a_copy_of_a_log_under_another_name_is_known_by_its_content(tmp_path: Path) -> None:
     log = write_mcap(tmp_path / "run.mcap")
     (tmp_path / "copy.mcap").write_bytes(log.path.read_bytes())
-    report = ingest([log.path, tmp_path / "copy.mcap"], tmp_path / "data", task_spec(log))
-    assert report.written == ["run"]
+    for root, logs in (("one", [log.path, tmp_path / "copy.mcap"]), ("other", [tmp_path / "copy.mcap", log.path])):
+        report = ingest(logs, tmp_path / root, task_spec(log))
+        assert report.written == ["copy"]
+        assert "byte for byte" in report.notes[0]
+    assert tree(tmp_path / "one") == tree(tmp_path / "other")
 
 
 def test_two_logs_of_the_same_name_are_two_episodes(tmp_path: Path) -> None:
@@ -374,6 +389,40 @@ def test_a_changed_demonstration_replaces_its_episode_and_is_named(tmp_path: Pat
     write_grown_zarr(tmp_path / "whole" / "replay.zarr", [12, 9, 5], edit_row=15)
     ingest([tmp_path / "whole" / "replay.zarr"], tmp_path / "fresh", zarr_task_spec())
     assert tree(root) == tree(tmp_path / "fresh")
+
+
+def test_a_store_of_which_most_changed_is_kept_beside_the_first_wherever_an_ingest_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "replay.zarr"
+    for root in ("whole", "killed"):
+        write_grown_zarr(log, [6, 5, 5, 5])
+        ingest([log], tmp_path / root, zarr_task_spec())
+        write_grown_zarr(log, [6, 4, 5, 5])  # rows move: of four demonstrations one is unchanged
+        if root == "killed":
+            with monkeypatch.context() as patch:
+                kill_after(2, patch)
+                with pytest.raises(KeyboardInterrupt):
+                    ingest([log], tmp_path / root, zarr_task_spec())
+        assert ingest([log], tmp_path / root, zarr_task_spec()).replaced == []
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
+def test_an_attribute_that_was_corrected_reaches_its_episode_without_decoding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, root = write_hdf5(tmp_path / "demos.hdf5"), tmp_path / "data"
+    table = zarr_task_spec().model_dump(by_alias=True) | {"state": None}
+    table["views"]["top"]["topic"], table["low_dim"]["agent"]["topic"] = "obs/top_image", "obs/eef"
+    table["action"]["target"]["topic"] = "actions"
+    spec = TaskSpec.model_validate(table)
+    written = ingest([log], root, spec).written
+    with h5py.File(log, "r+") as file:
+        file["data/demo_1"].attrs["success"] = "false"
+    monkeypatch.setattr("vilp_data.ingest.assemble_episode", lambda *_, **__: pytest.fail("decoded again"))
+    report = ingest([log], root, spec)
+    assert (report.fresh, report.restated) == (written, [written[1]])
+    assert EpisodeStore(root).entry(written[1]).outcome == "failure"
 
 
 def test_another_store_of_the_same_name_overwrites_nothing(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,21 +12,26 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from tests.faults import tree
-from tests.json_log import S, Said, image, joints, write_json_log
+from tests.faults import kill_after, tree
+from tests.json_log import START_NS, S, Said, image, joints, number, transform, write_json_log
 from tests.synthetic import task_spec, write_mcap
 from tests.synthetic_bags import write_rosbag1, write_rosbag2
 from tests.test_cut_log import GAP, task
+from tests.video_logs import JOINTS, PERIOD_NS, VIDEO, Row, spec_of, write_log
+from tests.video_logs import joints as video_joints
+from tests.video_packets import encode, numbered_frames, video_message
 from vilp_data import shards
 from vilp_data.cut_identity import Cut, cut_sha256
 from vilp_data.episode_entry import header_of
 from vilp_data.episodes import EpisodeStore
+from vilp_data.held_messages import held_sha256
 from vilp_data.ingest import IngestReport, ingest_logs
-from vilp_data.removed import read_removed
 from vilp_data.sources import open_log
+from vilp_data.sources.mcap_log import McapLog
 from vilp_data.spec import TaskSpec, load_task
 from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
 from vilp_data.surgery.undo import undo
+from vilp_data.types import LogEpisode
 
 BURSTS = ((0.0, 20), (5.0, 12), (10.0, 15))
 """Seconds, images at 10 Hz."""
@@ -63,6 +69,14 @@ def write_anew(log: Path, to: Path) -> Path:
         writer.finish()
     assert to.read_bytes() != log.read_bytes()
     return to
+
+
+def two_runs(folder: Path) -> tuple[Path, Path, TaskSpec]:
+    """A dataset of a.mcap and b.mcap; a.mcap, uncut; the spec."""
+    logs = [write_mcap(folder / f"{name}.mcap", jitter_s=0.001, seed=i) for i, name in enumerate("ab")]
+    spec = task_spec(logs[0])
+    ingest_logs([log.path for log in logs], folder / "data", spec, workers=1)
+    return folder / "data", logs[0].path, spec
 
 
 def ingest(log: Path, root: Path, spec: TaskSpec, **options: bool) -> IngestReport:
@@ -177,6 +191,126 @@ def test_a_cut_is_known_by_its_own_messages_however_the_log_is_packed(tmp_path: 
     assert hashes[0][0] != hashes[0][1]
 
 
+def two_arms(path: Path, *, swapped: bool = False) -> Path:
+    """Joints of a left arm that goes up, and of a right one that goes down, in two bursts; on each other's topics where `swapped`."""
+    left, right = ("/right", "/left") if swapped else ("/left", "/right")
+    said: list[Said] = []
+    for t in (start + k / 10 for start in (0.0, 5.0) for k in range(15)):
+        said += [image(t, index=round(t * 10)), joints(t, ["a"], [t], left), joints(t, ["a"], [-t], right)]
+    return write_json_log(path, said)
+
+
+@pytest.mark.parametrize("later", ["run.mcap", "other.mcap"])
+def test_messages_of_two_topics_that_were_mistaken_for_each_other_are_no_copy(tmp_path: Path, later: str) -> None:
+    root = tmp_path / "data"
+    spec = task(GAP, low_dim={"left": {"topic": "/left"}, "right": {"topic": "/right"}})
+    ingest(two_arms(tmp_path / "run.mcap", swapped=True), root, spec)
+    mended = two_arms(tmp_path / later)
+    report = ingest_logs([tmp_path / "run.mcap", mended] if later == "other.mcap" else [mended], root, spec, workers=1)
+    assert len(report.written) == 2
+    np.testing.assert_allclose(EpisodeStore(root).read(report.written[1]).low_dim[0], [5, -5], atol=1e-6)
+
+
+def test_the_numbers_of_channels_in_the_files_of_a_bag_do_not_matter(tmp_path: Path) -> None:
+    first = [
+        joints(k / 10, ["a"], [k * way], topic) for k in range(20) for way, topic in ((1, "/left"), (-1, "/right"))
+    ]
+    hashes = []
+    for name, swapped in (("alike", False), ("otherwise", True)):
+        bag = tmp_path / name
+        bag.mkdir()
+        halves = first[:20], [*first[21:22], *first[20:21], *first[22:]] if swapped else first[20:]
+        files = [write_json_log(bag / f"{name}_{i}.mcap", half).name for i, half in enumerate(halves)]
+        listed = "".join(f"    - {file}\n" for file in files)
+        (bag / "metadata.yaml").write_text(
+            "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n"
+            f"  relative_file_paths:\n{listed}  message_count: 40\n  compression_format: ''\n  compression_mode: ''\n"
+        )
+        with open_log(bag) as log:
+            assert len(list(log.messages(["/left", "/right"]))) == 40
+            hashes.append(
+                cut_sha256(log, Cut(START_NS, START_NS + 3 * S, ("/left", "/right")), "", lambda _, find: find())
+            )
+    assert hashes[0] == hashes[1]
+
+
+@pytest.mark.parametrize("changed", ["static transform", "command"])
+def test_a_cut_is_made_anew_where_what_holds_in_it_from_before_was_corrected(tmp_path: Path, changed: str) -> None:
+    def write(x: float, command: float) -> Path:
+        said = [transform(0.0, "base", "camera", x, "/tf_static"), number(0.2, command, "/command")]
+        for t in (start + k / 10 for start in (0.0, 5.0, 10.0) for k in range(15)):
+            said += [image(t, index=round(t * 10)), transform(t, "camera", "tool", t)]
+        return write_json_log(tmp_path / "run.mcap", [*said, number(9.9, 9.0, "/command")])
+
+    pose = {"topic": "/tf", "from_frame": "base", "to_frame": "tool"}
+    spec = task(GAP, low_dim={"pose": pose}, action={"target": {"topic": "/command", "clock": "log"}})
+    root = tmp_path / "data"
+    names = ingest(write(1.0, 1.0), root, spec).written
+    relabel_episodes(root, [names[1]], labels={"operator": "anna"})
+    key = EpisodeStore(root).entry(names[1]).key
+    static = changed == "static transform"
+    log = write(2.0, 1.0) if static else write(1.0, 4.0)
+    report = ingest(log, root, spec)
+    assert report.written == report.replaced == (names if static else names[:2])
+    assert ids(root) == names
+    middle = EpisodeStore(root).read(names[1])
+    assert middle.action is not None
+    np.testing.assert_allclose((middle.low_dim[0, 0], middle.action[0, 0]), (7, 1) if static else (6, 4), atol=1e-6)
+    entry = EpisodeStore(root).entry(names[1])
+    assert (entry.tags["operator"], entry.key == key) == ("anna", False)
+    assert ingest(log, root, spec).fresh == names
+
+
+@pytest.mark.parametrize("left_out", [2, 8, 18])
+def test_packets_that_a_video_s_decoder_needs_first_are_part_of_a_cut(tmp_path: Path, left_out: int) -> None:
+    sent = encode(numbered_frames(20), "h264")
+    cut = LogEpisode("cut", START_NS + 6 * PERIOD_NS, START_NS + 16 * PERIOD_NS)
+    found = []
+    for name, packets in (("all", sent), ("some", [*sent[:left_out], None, *sent[left_out + 1 :]])):
+        rows = [
+            Row(START_NS + i * PERIOD_NS, VIDEO, video_message(packet.data, "h264").body)
+            for i, packet in enumerate(packets)
+            if packet is not None
+        ]
+        with open_log(write_log(tmp_path / f"{name}.mcap", [*rows, *video_joints(20)])) as log:
+            place = Cut(cut.start_ns, cut.end_ns, (JOINTS, VIDEO))
+            forget: Any = lambda _, find: find()  # noqa: E731
+            found.append((cut_sha256(log, place, "", forget), held_sha256(log, cut, spec_of(VIDEO), "", forget)))
+    assert [one == other for one, other in zip(*found, strict=True)] == [left_out != 8, left_out != 2]
+
+
+def test_the_times_in_a_log_are_asked_for_once_however_many_cuts_look_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = [number(0.1, 1.0, "/command")]
+    for t in (3.0 * start + k / 10 for start in range(8) for k in range(5)):
+        said += [image(t, index=1), joints(t, ["a"], [t])]
+    log = write_json_log(tmp_path / "run.mcap", said)
+    spec = task(GAP, action={"target": {"topic": "/command", "clock": "log"}})
+    asked, whole = [], McapLog.message_times
+    monkeypatch.setattr(McapLog, "message_times", lambda log: asked.append(log) or whole(log))
+    assert len(ingest(log, tmp_path / "data", spec).written) == 8
+    assert len(asked) == 3  # for the gaps, what holds in the cuts, and their episodes
+
+
+@pytest.mark.parametrize("changed", [(5.0, 10.0), (0.0,)], ids=["most", "some"])
+def test_an_edited_log_is_ingested_alike_wherever_an_ingest_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: tuple[float, ...]
+) -> None:
+    log = tmp_path / "run.mcap"
+    for root in ("whole", "killed"):
+        names = ingest(write_bursts(log), tmp_path / root, task(GAP)).written
+        write_bursts(log, offset=dict.fromkeys(changed, 2.0))
+        if root == "killed":
+            with monkeypatch.context() as patch:
+                kill_after(1, patch)
+                with contextlib.suppress(KeyboardInterrupt):
+                    ingest(log, tmp_path / root, task(GAP))
+        ingest(log, tmp_path / root, task(GAP))
+        assert len(ids(tmp_path / root)) == len(names) + (2 if len(changed) == 2 else 0)
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
 def test_a_damaged_stretch_of_a_log_keeps_no_other_cut_back(tmp_path: Path) -> None:
     log, root = write_anew(write_bursts(tmp_path / "run.mcap"), tmp_path / "many_chunks.mcap"), tmp_path / "data"
     whole = log.read_bytes()
@@ -191,81 +325,15 @@ def test_a_damaged_stretch_of_a_log_keeps_no_other_cut_back(tmp_path: Path) -> N
     assert ingest(log, root, task(GAP)).fresh == report.written
 
 
-# --- a log that was written anew --------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def runs(tmp_path: Path) -> tuple[Path, Path, TaskSpec]:
-    """A dataset of a.mcap and b.mcap; a.mcap, uncut; the spec."""
-    logs = [write_mcap(tmp_path / f"{name}.mcap", jitter_s=0.001, seed=i) for i, name in enumerate("ab")]
-    spec = task_spec(logs[0])
-    ingest_logs([log.path for log in logs], tmp_path / "data", spec, workers=1)
-    return tmp_path / "data", logs[0].path, spec
-
-
-def test_a_removed_episode_does_not_come_back_in_other_bytes(runs: tuple[Path, Path, TaskSpec], tmp_path: Path) -> None:
-    root, log, spec = runs
-    relabel_episodes(root, ["a"], labels={"operator": "anna"})
-    trim_episodes(root, plan_trim(root, ["a"], steps=(3, 15)))
-    remove_episodes(root, ["a"], reason="dropped")
-    anew = write_anew(log, tmp_path / "anew" / "salvaged.mcap")
-    report = ingest(anew, root, spec)
-    assert (report.written, report.removed, ids(root)) == ([], ["a"], ["b"])
-    assert read_removed(root)["a"].source == "salvaged.mcap"
-    assert ingest(anew, root, spec).removed == ["a"]  # known by its bytes now
-    assert ingest(anew, root, spec, again=True).written == ["a"]
-    entry = EpisodeStore(root).entry("a")
-    assert (entry.n_steps, entry.tags["operator"]) == (12, "anna")
-
-
-def test_what_was_removed_comes_back_as_it_was_when_its_log_in_other_bytes_is_wanted_again(
-    runs: tuple[Path, Path, TaskSpec], tmp_path: Path
-) -> None:
-    root, log, spec = runs
-    relabel_episodes(root, ["a"], labels={"operator": "anna"})
-    remove_episodes(root, ["a"])
-    report = ingest(write_anew(log, tmp_path / "anew" / "a.mcap"), root, spec, again=True)
-    assert (report.written, read_removed(root)) == (["a"], {})
-    assert EpisodeStore(root).entry("a").tags["operator"] == "anna"
-
-
-def test_labels_and_trim_of_a_removed_episode_are_there_when_it_is_wanted_again(
-    runs: tuple[Path, Path, TaskSpec],
-) -> None:
-    root, log, spec = runs
-    relabel_episodes(root, ["a"], labels={"operator": "anna"})
-    trim_episodes(root, plan_trim(root, ["a"], steps=(3, 15)))
-    steps = EpisodeStore(root).steps_path("a").read_bytes()
-    remove_episodes(root, ["a"])
-    assert ingest(log, root, spec, again=True).written == ["a"]
-    assert EpisodeStore(root).steps_path("a").read_bytes() == steps
-
-
-def test_a_stored_episode_in_other_bytes_is_known_and_not_stored_twice(
-    runs: tuple[Path, Path, TaskSpec], tmp_path: Path
-) -> None:
-    root, log, spec = runs
-    relabel_episodes(root, ["a"], labels={"operator": "anna"})
-    key, before = EpisodeStore(root).entry("a").key, tree(root)
-    anew = write_anew(log, tmp_path / "anew" / "a.mcap")
-    report = ingest(anew, root, spec)
-    assert (report.written, report.fresh, len(ids(root))) == ([], ["a"], 2)
-    entry = EpisodeStore(root).entry("a")
-    assert (entry.key, entry.tags["operator"]) == (key, "anna")  # a model that learnt from it still knows it
-    done = tree(root)
-    assert ingest(anew, root, spec).notes == []
-    assert tree(root) == done
-    undo(root)
-    assert tree(root) == before
-
-
 def test_the_same_picture_at_another_time_is_another_episode(tmp_path: Path) -> None:
     """A camera that looks at a wall: equal content is no proof."""
     root, spec = tmp_path / "data", task({"by": "file"}, low_dim={})
-    for name, start in (("a", 0.0), ("b", 60.0)):
+    for day, start in (("monday", 0.0), ("tuesday", 60.0)):
+        (tmp_path / day).mkdir()
         said = [image(start + k / 10, index=k) for k in range(8)]
-        report = ingest(write_json_log(tmp_path / f"{name}.mcap", said), root, spec)
-        assert report.written == [name]
+        report = ingest(write_json_log(tmp_path / day / "run.mcap", said), root, spec)
+        assert len(report.written) == 1
+    assert len(ids(root)) == 2
 
 
 # --- what a ranges file says ----------------------------------------------------------------------------------------------------
@@ -313,6 +381,15 @@ def test_a_range_that_was_edited_replaces_the_episode_that_it_overlaps(tmp_path:
     assert (entry.n_steps, entry.tags["operator"], entry.source_episode) == (15, "anna", "at-00000.300s")
 
 
+def test_a_stored_demonstration_that_failed_and_was_cut_otherwise_is_not_left_as_it_was(tmp_path: Path) -> None:
+    log, root = write_bursts(tmp_path / "run.mcap"), tmp_path / "data"
+    (name,) = ingest(log, root, with_ranges(tmp_path, "start,end,success\n0,1.5,true\n")).written
+    report = ingest(log, root, with_ranges(tmp_path, "start,end,success\n0.2,1.5,false\n"))
+    assert (report.replaced, report.left_out) == ([name], [])
+    assert EpisodeStore(root).entry(name).outcome == "failure"
+    assert any(f"{name}: a failure now" in note for note in report.notes)
+
+
 def test_a_range_that_was_parted_in_two_leaves_no_overlap(tmp_path: Path) -> None:
     log, root = write_bursts(tmp_path / "run.mcap"), tmp_path / "data"
     ingest(log, root, with_ranges(tmp_path, "start,end\n0,1.9\n"))
@@ -347,10 +424,10 @@ def test_an_episode_stored_before_there_were_cuts_stays_fresh_byte_for_byte(tmp_
     assert tree(root) == before
 
 
-def test_a_list_of_removed_episodes_of_before_is_read(runs: tuple[Path, Path, TaskSpec]) -> None:
+def test_a_list_of_removed_episodes_of_before_is_read(tmp_path: Path) -> None:
     import json
 
-    root, log, spec = runs
+    root, log, spec = two_runs(tmp_path)
     remove_episodes(root, ["a"])
     table = json.loads((root / "removed.json").read_text())
     for one in table["episodes"].values():
@@ -360,16 +437,14 @@ def test_a_list_of_removed_episodes_of_before_is_read(runs: tuple[Path, Path, Ta
     assert ingest(log, root, spec).removed == ["a"]
 
 
-def test_an_ingest_of_other_logs_does_not_join_a_killed_one(
-    runs: tuple[Path, Path, TaskSpec], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_ingest_of_other_logs_does_not_join_a_killed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its command says which logs; taking the second one back must leave what the first had stored."""
     import sys
 
     from vilp_data import ingest as module
     from vilp_data.history import read_history
 
-    root, _, spec = runs
+    root, _, spec = two_runs(tmp_path)
     logs = [write_mcap(tmp_path / f"{name}.mcap", jitter_s=0.001, seed=7 + i).path for i, name in enumerate("cd")]
 
     def killed(*_: object, **__: object) -> None:

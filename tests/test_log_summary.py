@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
+from tests.lerobot_folders import write_v21
 from tests.real_data import real_data
 from tests.synthetic import HEADER_LAG_NS, JOINT_TOPIC, START_NS, image_topic, write_mcap, write_zarr
 from vilp_data import log_summary
-from vilp_data.log_summary import LogSummary, TopicSummary, format_summary, summarise
+from vilp_data.check.log import check_log
+from vilp_data.log_summary import MOST_TOPICS, LogSummary, TopicSummary, format_summary, summarise
 
 
 def topic(summary: LogSummary, name: str) -> TopicSummary:
@@ -54,6 +56,43 @@ def test_a_gap_is_found(tmp_path: Path) -> None:
     found = topic(summarise(write_stamped(tmp_path / "run.mcap", times, times)), "/t")
     assert found.max_gap_s == pytest.approx(3.1)
     assert found.rate_hz == pytest.approx(10)
+
+
+def test_a_topic_that_comes_in_bursts_has_the_rate_of_its_messages_over_the_log(tmp_path: Path) -> None:
+    times = [START_NS + burst * 500_000_000 + i * 500_000 for burst in range(20) for i in range(30)]
+    path = write_stamped(tmp_path / "run.mcap", times, times)
+    (checked,) = check_log(path).topics
+    assert topic(summarise(path), "/t").rate_hz == pytest.approx(599 / 9.5145)
+    assert checked.timing is not None
+    assert checked.timing.rate_hz == topic(summarise(path), "/t").rate_hz
+
+
+def test_two_messages_at_once_are_no_fast_topic(tmp_path: Path) -> None:
+    times = [START_NS, START_NS + 2, START_NS + 10 * 10**9]
+    assert topic(summarise(write_stamped(tmp_path / "run.mcap", times, times)), "/t").rate_hz == pytest.approx(0.2)
+    assert topic(summarise(write_stamped(tmp_path / "all.mcap", [START_NS] * 3, times)), "/t").rate_hz is None
+
+
+def test_very_many_topics_of_one_message_are_only_counted_in_the_terminal(tmp_path: Path) -> None:
+    with (tmp_path / "run.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "test")
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        for number in range(MOST_TOPICS + 1):
+            channel = writer.register_channel(f"/t{number}", "json", schema)
+            for i in range(2 if number == 7 else 1):
+                writer.add_message(channel, START_NS + i, b"{}", START_NS + i)
+        writer.finish()
+    text = format_summary(summarise(tmp_path / "run.mcap"))
+    assert [line.split()[0] for line in text.splitlines()[1:] if line.startswith("/t")] == ["/t7"]
+    assert f"and {MOST_TOPICS} topics of one message or none" in text
+
+
+def test_episodes_that_are_absent_are_no_gap(tmp_path: Path) -> None:
+    folder = write_v21(tmp_path / "robot", lengths=(20, 15, 12))
+    folder.table(1).unlink()
+    found = topic(summarise(folder.path), "action")
+    assert (found.max_gap_s, found.rate_hz) == (pytest.approx(1 / 30), pytest.approx(30))
 
 
 def test_a_log_clock_that_jumps_back_is_told(tmp_path: Path) -> None:

@@ -423,6 +423,8 @@ def test_the_real_log_that_a_transfer_mangled_comes_back_whole(tmp_path: Path) -
     report = salvage_log(path, tmp_path / "out.mcap")
     assert (report.recovered, report.suspicious, report.unverified) == (4702, 0, 0)
     assert len(read_log(tmp_path / "out.mcap")) == 4702
+    assert report.complete
+    assert "behind the last message, where a log keeps none" in format_report(report)
 
 
 # --- use --------------------------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def test_a_suggestion_is_written_once_and_ingested(work: Path) -> None:
     assert load_task("mine.toml").name == "mine"
     assert isinstance(run("inspect", "run.mcap", "--suggest-spec", "-o", "mine.toml").exception, UsageError)
     ingested = run("ingest", "run.mcap", "--task", "mine.toml", "--workers", "1")
-    assert (ingested.exit_code, "data/mine: 1 episodes ingested" in ingested.stdout) == (0, True)
+    assert (ingested.exit_code, "data/mine: 1 episode ingested" in ingested.stdout) == (0, True)
 
 
 def test_a_suggestion_goes_to_stdout_by_itself(work: Path) -> None:

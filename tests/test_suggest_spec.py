@@ -26,7 +26,9 @@ from vilp_data.log_summary import format_summary, summarise
 from vilp_data.model_size import common_size, cut_share, model_size
 from vilp_data.sources.mcap_log import McapLog
 from vilp_data.spec import TaskSpec, parse_task
-from vilp_data.suggest_spec import suggest_spec
+from vilp_data.suggest_spec import _part_names, suggest_spec
+from vilp_data.topic_roles import role_of
+from vilp_data.types import Message
 
 
 def ingested(log: Path, text: str, root: Path) -> EpisodeStore:
@@ -101,6 +103,28 @@ def test_a_real_robot_s_table_and_camera_are_found() -> None:
         ["observation.state"],
         ["action"],
     )
+
+
+def test_a_topic_of_one_message_is_no_state(tmp_path: Path) -> None:
+    log = write_json_log(tmp_path / "run.mcap", [*frames(), joints(0.5, ["a", "b"], [0.0, 1.0])])
+    assert suggested(log).low_dim == {}
+    assert "but one message only" in suggest_spec(log)
+
+
+def test_topics_that_end_alike_are_named_by_what_tells_them_apart() -> None:
+    sensors = ("ship/pressure_pa/ins/3/sbg", "ship/heave_m/ins/3/sbg", "ship/fix/ins/3/sbg", "ship/fix/ins/0/anavs")
+    names = _part_names([*sensors, "/left/joint_states", "ship/fix/ins/1/anavs"])
+    assert names == {
+        sensors[0]: "pressure_pa", sensors[1]: "heave_m", sensors[2]: "fix", sensors[3]: "ins_0_anavs",
+        "/left/joint_states": "left_joint_states", "ship/fix/ins/1/anavs": "ins_1_anavs",
+    }  # fmt: skip
+    twice = _part_names(["a/fix/b/c/d", "a/pose/b/c/d", "a/fix/e/f/g", "a/pose/e/f/g"])
+    assert sorted(twice.values()) == ["fix_b_c_d", "fix_e_f_g", "pose_b_c_d", "pose_e_f_g"]
+
+
+def test_a_clock_is_no_command() -> None:
+    assert role_of("/time_reference", [Message("/time_reference", "array", 0, 0, np.zeros(2))]).kind == "unused"
+    assert role_of("/reference", [Message("/reference", "array", 0, 0, np.zeros(2))]).kind == "command"
 
 
 # --- choices ------------------------------------------------------------------------------------------------------------------------

@@ -242,8 +242,14 @@ def test_a_trim_that_would_be_refused_is_refused_when_planned(root: Path) -> Non
         with pytest.raises(UsageError, match=r"no such range|no motion"):
             plan_trim(root, ["a"], steps=steps)
     trim_episodes(root, plan_trim(root, ["a"], steps=(8, 15)))
-    with pytest.raises(UsageError, match="no such range"):
+    with pytest.raises(UsageError, match=r"trimmed off before\n.*0:5; steps 8 to 14 are left"):
         plan_trim(root, ["a"], steps=(0, 5))
+    with pytest.raises(UsageError, match="12:9 of an episode of 20 steps"):  # as it was typed and ingested
+        plan_trim(root, ["a"], steps=(12, 9))
+
+
+def test_a_range_past_the_last_step_is_said(root: Path) -> None:
+    assert [cut.past_end for end in (20, 9999) for cut in plan_trim(root, ["a"], steps=(10, end))] == [False, True]
 
 
 def test_ranges_of_steps_are_slices() -> None:

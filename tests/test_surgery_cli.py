@@ -13,9 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.stored_episodes import add_episodes, episode, write_dataset
-from tests.surgery_operations import other_dataset
+from tests.surgery_operations import ingest_all, other_dataset
+from tests.synthetic import write_zarr
+from tests.test_cli import ZARR_TASK
 from vilp_data.cli import main
-from vilp_data.dataset_state import DatasetState, EpisodeState
+from vilp_data.dataset_state import DatasetState, EpisodeState, read_state
 from vilp_data.edits import edited, edits_of, relabelled, trimmed
 from vilp_data.episode_entry import EpisodeEntry
 from vilp_data.episodes import EpisodeStore
@@ -52,10 +54,10 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 def test_a_session_of_surgery_reads_as_it_should(shell: Shell) -> None:
-    assert "1 episodes removed (operation 2;" in shell('remove b --reason "too dark" --data data/tuesday')
+    assert "1 episode removed (operation 2;" in shell('remove b --reason "too dark" --data data/tuesday')
     assert "nothing to remove\n  b: removed already, by operation 2" in shell("remove b")
     assert "a: keeps steps 3 to 14, 12 of 20; 0.3 s at the start, 0.5 s at the end go" in shell("trim a --steps 3:15")
-    assert "1 episodes relabelled" in shell("relabel c --set operator=anna --outcome failure")
+    assert "1 episode relabelled" in shell("relabel c --set operator=anna --outcome failure")
     assert "2 episodes taken from data/monday, with 4 latent files" in shell("merge data/monday data/tuesday")
     log = shell("log data/tuesday")
     for words in (
@@ -135,6 +137,72 @@ def test_what_an_undo_took_comes_back_by_the_command_it_names(shell: Shell) -> N
     command = said.partition("`vilp-data ")[2].partition("`")[0]
     assert "operation 2 (relabel) brought again" in shell(command)
     assert EpisodeStore(Path("data/tuesday")).entry("a").tags == {"operator": "anna"}
+
+
+def test_the_first_ingest_taken_back_comes_back_by_the_command_it_names(shell: Shell) -> None:
+    root = Path("data/my logs")
+    write_zarr(Path("push.zarr"))
+    ingest_all(Path("push.zarr"), root)
+    before = read_state(root).digest
+    said = shell(f"undo '{root}'")
+    assert "operation 1 (ingest) taken back" in said
+    assert "operation 1 (ingest) taken back" in shell("log")
+    assert "0 episodes" in shell("diff 1", ends=1)
+    shell("gc --dry-run")
+    command = said.partition("`vilp-data ")[2].partition("`")[0]
+    assert "operation 1 (ingest) brought again; 3 episodes" in shell(command)
+    assert read_state(root).digest == before
+
+
+def test_a_dataset_given_for_a_log_is_told_apart(shell: Shell) -> None:
+    said = shell("inspect data/tuesday", ends=2)
+    assert "a dataset, not a log" in said
+    assert "`vilp-data check data/tuesday`" in said
+    assert "`vilp-data view data/tuesday --html PAGE.html`" in shell("view data/tuesday", ends=2)
+    Path("data/stopped").mkdir()
+    Path("data/stopped/.lock").touch()
+    assert "holds no episode yet" in shell("check data/stopped", ends=2)
+
+
+def test_a_misspelt_episode_of_many_lists_a_screenful(shell: Shell) -> None:
+    add_episodes(Path("data/tuesday"), *(episode(f"more-{i:03d}", 2) for i in range(50)))
+    said = shell("remove nosuch --data data/tuesday", ends=2)
+    assert "a, b, c, d, more-000" in said
+    assert said.count("more-") == 16
+    assert "and 34 more" in said
+
+
+@pytest.mark.parametrize(("verb", "instead"), [("redo", "undo --operation N"), ("add", "ingest LOGS")])
+def test_verbs_that_people_look_for_name_the_one_there_is(shell: Shell, verb: str, instead: str) -> None:
+    assert instead in shell(f"{verb} data/tuesday", ends=2)
+
+
+def test_a_range_past_the_last_step_is_kept_to_and_said(shell: Shell) -> None:
+    said = shell("trim a --steps 10:9999 --data data/tuesday")
+    assert "10 of 20" in said
+    assert "a: the range goes on past its last step" in said
+
+
+def test_an_ingest_after_an_undone_one_says_that_its_history_goes_on(shell: Shell) -> None:
+    Path("zarr.toml").write_text(ZARR_TASK)
+    write_zarr(Path("push.zarr"), episode_lengths=(5,))
+    ingest = "ingest push.zarr --task zarr.toml --workers 1"
+    assert "data/zarr: 1 episode ingested" in shell(ingest)
+    shell("undo data/zarr")
+    assert "its history goes on: `vilp-data log data/zarr`" in shell(ingest)
+
+
+def test_a_log_that_cannot_be_read_is_named_once(shell: Shell) -> None:
+    Path("zarr.toml").write_text(ZARR_TASK)
+    Path("cut.mcap").write_bytes(b"\x89MCAP0\r\n")
+    assert shell("ingest cut.mcap --task zarr.toml --workers 1", ends=1).count("cut.mcap: ") == 1
+
+
+def test_verbs_that_need_episodes_say_how_those_of_an_undone_ingest_come_back(shell: Shell) -> None:
+    write_zarr(Path("push.zarr"))
+    ingest_all(Path("push.zarr"), Path("data/push"))
+    shell("undo data/push")
+    assert "`vilp-data undo data/push --operation N` brings again" in shell("split data/push", ends=2)
 
 
 def test_a_dataset_that_is_called_as_an_operation_is_asked_about(shell: Shell) -> None:

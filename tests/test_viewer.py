@@ -22,6 +22,7 @@ import pytest
 from mcap.writer import Writer
 from rerun.chunk import Chunk, RrdReader
 
+from tests.lerobot_folders import write_v21
 from tests.real_data import real_data
 from tests.synthetic import (
     JOINTS,
@@ -213,6 +214,17 @@ def test_the_first_of_many_episodes_is_shown_and_said(tmp_path: Path) -> None:
     drawn = viewer.draw_log(log.path, tmp_path / "a.rrd", spec=zarr_task_spec())
     assert "3 episodes, showing episode_000" in drawn.notes[0]
     assert len(raw_frames(tmp_path / "a.rrd", "img", 32, 32)) == 12
+
+
+def test_the_first_episode_that_has_all_its_files_is_shown(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_v21(tmp_path / "robot")
+    folder.video(0).unlink()
+    drawn = viewer.draw_log(folder.path, tmp_path / "a.rrd")
+    whole = "of which episode_000001, episode_000002 have all their files, showing episode_000001; --episode NAME"
+    assert whole in drawn.notes[0]
+    with pytest.raises(LogError, match="the video is missing"):
+        viewer.draw_log(folder.path, tmp_path / "b.rrd", episode="episode_000000")
+    assert capfd.readouterr() == ("", "")  # nor any word of the library below
 
 
 def test_another_episode_is_shown_by_name(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from vilp_data.contact_sheet import captioned, grid, stacked, to_png
 from vilp_data.dataset_split import find_split
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import UsageError
+from vilp_data.errors import UsageError, number_of
 from vilp_data.keys import digest
 from vilp_data.plots import vector_parts
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
@@ -43,10 +43,10 @@ _IDENTIFIER = re.compile(r"[A-Za-z0-9.+-]+")
 
 @dataclass(frozen=True)
 class Card:
-    """The page, and the picture that it shows beside it: PNG bytes."""
+    """The page, and the picture that it shows beside it: PNG bytes, or None where the dataset has no view."""
 
     markdown: str
-    sheet: bytes
+    sheet: bytes | None
 
 
 def write_card(
@@ -57,16 +57,17 @@ def write_card(
     only: Collection[str] | None = None,
     exported: Sequence[str] = (),
     force: bool = False,
-) -> Path:
-    """Write the card as `path`, the contact sheet beside it; returns the sheet's path.
+) -> Path | None:
+    """Write the card as `path`, the contact sheet beside it; returns the sheet's path, None where the dataset has no view.
 
     Raises UsageError where `path` is a page that somebody wrote, unless `force` is given, and as `make_card` does."""
     _require_free(path, force=force)
     sheet = path.with_name(path.stem + SHEET_SUFFIX)
     card = make_card(store, licence=licence, only=only, exported=exported, sheet_name=sheet.name)
-    shards.write_atomic(sheet, card.sheet)
+    if card.sheet is not None:
+        shards.write_atomic(sheet, card.sheet)
     shards.write_atomic(path, card.markdown.encode())
-    return sheet
+    return None if card.sheet is None else sheet
 
 
 def _require_free(path: Path, *, force: bool) -> None:
@@ -96,7 +97,9 @@ def make_card(
     parts: list[Iterable[str]] = [
         _front_matter(licence),
         [f"# {spec.name}", "", _summary(entries)],
-        [f"![frames of {min(len(entries), SHEET_EPISODES)} episodes over time]({sheet_name})"],
+        [f"![frames of {number_of(min(len(entries), SHEET_EPISODES), 'episode')} over time]({sheet_name})"]
+        if spec.views
+        else [],
         _section("This export", [f"- {line}" for line in exported]) if exported else [],
         _section("Views", _views(store, spec, entries)),
         _section("Numbers", _vectors(store, spec, entries, lock)),
@@ -107,11 +110,11 @@ def make_card(
         _section("Licence", [licence or "Not stated."]),
     ]
     text = "\n".join("\n".join(part) + "\n" for part in parts if part)
-    return Card(text, to_png(contact_sheet(store, spec, entries)))
+    return Card(text, to_png(contact_sheet(store, spec, entries)) if spec.views else None)
 
 
 def contact_sheet(store: EpisodeStore, spec: TaskSpec, entries: Sequence[EpisodeEntry]) -> U8:
-    """A block of rows for each view: episodes evenly chosen, each from its first frame to its last. uint8 [H,W,3]."""
+    """A block of rows for each view, at least one: episodes evenly chosen, each from its first frame to its last. uint8 [H,W,3]."""
     chosen = [entries[i] for i in _evenly(len(entries), SHEET_EPISODES)]
     columns = [f"{round(100 * share)} %" for share in np.linspace(0, 1, SHEET_TIMES)]
     blocks = []
@@ -176,8 +179,8 @@ def _summary(entries: Sequence[EpisodeEntry]) -> str:
     rate = f"{rates[0]:g} Hz" if len(rates) == 1 else f"{rates[0]:g} to {rates[-1]:g} Hz"
     middle = seconds[len(seconds) // 2]
     return (
-        f"{len(entries)} episodes, {steps} steps at {rate}: {_duration(sum(seconds))} in all, from {seconds[0]:.1f} s to"
-        f" {seconds[-1]:.1f} s each, the middle one {middle:.1f} s. {labelled} have actions,"
+        f"{number_of(len(entries), 'episode')}, {number_of(steps, 'step')} at {rate}: {_duration(sum(seconds))} in all,"
+        f" from {seconds[0]:.1f} s to {seconds[-1]:.1f} s each, the middle one {middle:.1f} s. {labelled} have actions,"
         f" {sum(entry.has_state for entry in entries)} the simulator's state."
     )
 
@@ -189,6 +192,8 @@ def _duration(seconds: float) -> str:
 
 
 def _views(store: EpisodeStore, spec: TaskSpec, entries: Sequence[EpisodeEntry]) -> list[str]:
+    if not spec.views:
+        return ["None: numbers alone."]
     rows = []
     for view, table in spec.views.items():
         height, width, channels = open_frames(store, entries[0], view).shape[1:]
@@ -213,7 +218,7 @@ def _vectors(
 ) -> Iterator[str]:
     """A row for each number of low_dim and action: unit and frame, and its statistics over valid training steps."""
     training = [entry for entry in entries if lock is None or lock.assignment.get(entry.id) == "train"]
-    whose = "training episodes" if lock is not None and training else "episodes"
+    whose = "training episode" if lock is not None and training else "episode"
     rows, untold = [], []
     tables: list[tuple[str, Mapping[str, ActionSpec | VectorSpec]]] = [
         ("low_dim", spec.low_dim),
@@ -236,7 +241,7 @@ def _vectors(
     yield from _table(["column", "part", "meaning", "mean", "deviation", "least", "greatest"], rows)
     yield ""
     yield from untold
-    yield f"Statistics over the valid steps of {len(training or entries)} {whose}."
+    yield f"Statistics over the valid steps of {number_of(len(training or entries), whose)}."
 
 
 def _meaning(part: ActionSpec | VectorSpec | None) -> str:
@@ -284,7 +289,7 @@ def _tags(entries: Sequence[EpisodeEntry]) -> list[str]:
         rows.append([f"`{name}`", _counted(counts) + (f"; {missing} without" if missing else "")])
     edited = {what: sum(what in entry.edits for entry in entries) for what in ("labels", "trim")}
     words = {"labels": "relabelled", "trim": "trimmed"}
-    told = [f"{count} episode{'s' * (count > 1)} {words[what]}" for what, count in edited.items() if count]
+    told = [f"{number_of(count, 'episode')} {words[what]}" for what, count in edited.items() if count]
     return [
         *_table(["tag", "values (episodes)"], rows),
         *(["", f"Since the ingest: {', '.join(told)}."] if told else []),
@@ -301,7 +306,8 @@ def _counted(counts: Counter[str]) -> str:
 def _findings(entries: Sequence[EpisodeEntry]) -> Iterator[str]:
     masked = {entry.id: entry.n_steps - entry.n_valid for entry in entries if entry.n_valid < entry.n_steps}
     yield (
-        f"{sum(masked.values())} steps of {len(masked)} episodes are masked: no observation or action there may be used."
+        f"Masked: {number_of(sum(masked.values()), 'step')} of {number_of(len(masked), 'episode')}."
+        " No observation or action there may be used."
         if masked
         else "No step is masked."
     )
@@ -335,4 +341,4 @@ def _sources(entries: Sequence[EpisodeEntry]) -> Iterator[str]:
     if len(logs) > MOST_SOURCES:
         yield f"And {len(logs) - MOST_SOURCES} logs more."
     contents = {entry.id: entry.content_sha256 for entry in entries}
-    yield f"SHA-256 over the contents of all {len(entries)} episodes: `{digest(contents)}`."
+    yield f"SHA-256 over the contents of {number_of(len(entries), 'episode')}: `{digest(contents)}`."

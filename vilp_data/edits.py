@@ -80,8 +80,6 @@ def relabelled(entry: EpisodeEntry, *, labels: Mapping[str, str], unset: tuple[s
 
 def restated(entry: EpisodeEntry, tags: Mapping[str, str]) -> EpisodeEntry:
     """The entry with what its log says of it today, and the labels that people set on top."""
-    if dict(tags) == entry.edits.get("log_tags", entry.tags):
-        return entry
     labels = edits_of(entry.edits)
     edits = {name: value for name, value in entry.edits.items() if name not in ("labels", "log_tags", "log_outcome")}
     plain = replace(entry, tags=dict(tags), outcome=outcome_of(tags), edits=edits)

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import ctypes
 import multiprocessing
+import multiprocessing.util
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from vilp_data.errors import VilpDataError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+PATIENCE_S = 2.0
+"""How long a worker that is told to end may take: a call into a library is not broken off."""
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -69,8 +75,7 @@ def map_unordered(
             remedy="run it again with fewer --workers: what was finished is kept",
         ) from error
     except (KeyboardInterrupt, GeneratorExit):  # nobody waits for the rest, and every write is whole or not there
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.kill()
+        _end(set(multiprocessing.active_children()) - others)
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -88,10 +93,29 @@ def _submit(
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def _end(workers: set[BaseProcess]) -> None:
+    """End worker processes: asked to, so that they give back the named semaphores of the libraries they use; after PATIENCE_S by force."""
+    for worker in workers:
+        worker.terminate()
+    deadline = time.monotonic() + PATIENCE_S
+    for worker in workers:
+        worker.join(max(deadline - time.monotonic(), 0.0))
+        if worker.is_alive():
+            worker.kill()
+
+
 def _start_worker(parent: int, initializer: Callable[..., None] | None, initargs: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGTERM, _leave)
     _die_with_parent(parent)
     if initializer is not None:
         initializer(*initargs)
+
+
+def _leave(signal_number: int, frame: object) -> None:
+    """End this worker where it stands, past the pool, which would take an exception for the outcome of its item and begin the next."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    multiprocessing.util._exit_function()  # type: ignore[attr-defined]  # what the end of a process runs: gives the semaphores back
+    os._exit(128 + signal_number)
 
 
 def _die_with_parent(parent: int) -> None:

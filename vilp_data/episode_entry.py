@@ -34,7 +34,8 @@ class EpisodeEntry:
 
     `n_steps`, `n_valid`, `n_frames`, `key` and `content_sha256` are those of what there is to read: of a trimmed episode, the part
     that was kept. `edits` is empty for an episode as its log gave it; else it says what was changed since, see `edits`. `cut` is empty
-    unless the task cut it out of its log: {"start_ns", "end_ns", "topics"}, the messages that `source_sha256` is of."""
+    unless the task cut it out of its log: {"start_ns", "end_ns", "topics"}, the messages that `source_sha256` is of; "held", where it was
+    made of others too, their SHA-256."""
 
     id: str
     source: str

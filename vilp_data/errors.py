@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -80,9 +81,22 @@ class ActionSetError(VilpDataError):
 
 
 def salvage_command(log: Path) -> str:
-    """The whole command that gets back what a damaged log still holds, in backticks."""
-    clean = log.with_name(f"{Path(log.name.removesuffix('.active')).stem}-salvaged.mcap")
+    """The whole command that gets back what a damaged log still holds, in backticks: beside it, or where nobody may write there, in the
+    folder at hand."""
+    clean = Path(f"{Path(log.name.removesuffix('.active')).stem}-salvaged.mcap")
+    if not log.parent.is_dir() or os.access(log.parent, os.W_OK):
+        clean = log.with_name(clean.name)
     return f"`vilp-data salvage {shlex.quote(str(log))} -o {shlex.quote(str(clean))}`"
+
+
+def mangled(what: str, log: Path, head: bytes) -> LogError:
+    """Of a log whose line endings a transfer converted: `what` it is, and the first bytes that show it."""
+    remedy = (
+        f"copy it again in binary mode (git: mark *{log.suffix} as binary in .gitattributes); {salvage_command(log)} gets"
+        " back what is there"
+    )
+    found = f"it begins with {head!r}"
+    return LogError(f"{what} mangled in transfer, its line endings converted", where=log, found=found, remedy=remedy)
 
 
 def copy_or_salvage(log: Path) -> str:
@@ -106,14 +120,23 @@ def copy_again(what: str, *, leave: str = "") -> str:
     return f"copy the {what} again from its source" + (f", or leave {leave} out" if leave else "")
 
 
+MOST_KNOWN = 20
+"""Names that a remedy lists at most: a few lines, and all topics of most logs."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A remedy that names the nearest known name: `did you mean 'rate_hz'? known: ...`."""
+    """A remedy that names the nearest known name: `did you mean 'rate_hz'? known: ...`; of many only the first."""
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}known: {', '.join(names) if names else '(none)'}"
+    return f"{hint}known: {some_of(names, MOST_KNOWN) if names else '(none)'}"
 
 
 def some_of(names: Sequence[str], most: int) -> str:
     """The first `most` of these names, and how many more there are: `a, b and 3 more`."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def number_of(count: int, what: str) -> str:
+    """How many there are of what has a regular plural: `1 episode`, `24 files`."""
+    return f"{count} {what}" + ("" if count == 1 else "s")

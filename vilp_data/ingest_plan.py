@@ -1,7 +1,8 @@
 """What an ingest has to do: which stored episode each demonstration is, which are fresh, and what must not be mixed.
 
 A demonstration is known by its bytes: by the log's where it is alone in its log (`HashCache.of_log`), by its own rows or messages where
-it is one of several (`cut_identity`). The same bytes are the same episode, whatever the log is called now. For bytes that are not stored:
+it is one of several (`cut_identity`). The same bytes are the same episode, whatever the log is called now; where only what a cut takes in
+from before it changed (`held_messages.held_sha256`), it is made anew in its place. For bytes that are not stored:
 
 - A demonstration that is cut from a log, and overlaps the range of a known one that the same log still holds, is that one, cut otherwise
   since: its log has grown, or its line in a ranges file was edited. It replaces the episode, and labels stay. Which log is the same is
@@ -10,17 +11,19 @@ it is one of several (`cut_identity`). The same bytes are the same episode, what
   unchanged, is the same log grown or edited: demonstrations of a new name are added, those of a known name replace their episode,
   unless another log of this call holds that episode. `Plan.replaced` names what is replaced.
 - What was removed on purpose (`removed`) is known in the same ways, and stays out.
-- Anything else is new. Where its name is taken it gets the first digits of its hash as a suffix: logs of several days may all be
-  called run.mcap, and none may overwrite another. `Plan.notes` says so. Whether it shows the same as a known episode, its log having
-  been written anew in other bytes, is seen once it is decoded: `Plan.known`.
+- Anything else is new, under the first free name: where its own is taken, with the first digits of its hash, for logs of several days
+  may all be called run.mcap. Whether it shows the same as a known episode is seen once it is decoded: `known_content`.
+- A new demonstration that failed, or a policy's own, is left out unless it is asked for; one that is stored is never left out: what its
+  log says of it today is stored too, and said.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
+from typing import Literal
 
 from vilp_data.cut_identity import Cut
 from vilp_data.demonstrations import CUT_TAG, LOG_TAG
@@ -28,43 +31,38 @@ from vilp_data.edits import Edits, edits_of, restated
 from vilp_data.episode_entry import free_id
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, some_of
-from vilp_data.ingest_sources import KnownCut, Source, Sources, read_sources
+from vilp_data.ingest_sources import KnownCut, Source, Sources, held_of, read_sources
 from vilp_data.keys import episode_key, first_difference
+from vilp_data.known_content import KnownContent, known_contents, written_anew
 from vilp_data.log_hashes import HashCache
 from vilp_data.removed import Removed, RemovedEpisode, read_removed
 from vilp_data.spec import TaskSpec
 from vilp_data.types import is_rollout, outcome_of
 
+Unwanted = Literal["left_out", "rollouts"]
+
 
 @dataclass(frozen=True)
 class Planned:
     """A demonstration that is to be ingested, as the episode `id`; `edits` are what people did to it since its last ingest. `is_new`: it
-    is no episode that is known by its bytes or its place in a log."""
+    is no episode that is known by its bytes or its place in a log; `may_be`: stored ones whose log may have been written anew as this
+    one's. `unwanted`: unless it is one of these, it is left out, as a failure or as a policy's rollout."""
 
     id: str
     source: Source
     key: str
     edits: Edits | None = None
     is_new: bool = True
-
-
-@dataclass(frozen=True)
-class KnownContent:
-    """What shows an episode to be a known one: `tick_ns` is the time of its step `step`, None where nobody remembers. `removed`: what
-    people had decided about one that was removed, None for a stored one."""
-
-    id: str
-    step: int
-    tick_ns: int | None = None
-    removed: Edits | None = None
+    may_be: frozenset[str] = frozenset()
+    unwanted: Unwanted | None = None
 
 
 @dataclass
 class Plan:
     """`todo` in order of logs; ids of what is fresh, left out as a failure, a policy's `rollouts` left out, `removed` on purpose before,
-    `replaced` by what is to do; `restated`: entries of fresh ones of which the task says something else now; what could not be read
-    (name, why); sentences about names that are not what they were; `rate_hz` of the episodes that stay, None where none do;
-    `known`: content hash -> the episodes of that content that are stored, or were removed."""
+    `replaced` by what is to do; `restated`: entries of fresh ones of which the task or the log says something else now; what could not be
+    read (name, why); sentences; `rate_hz` of the episodes that stay, None where none do; `known`: content hash -> the episodes of that
+    content that some of `todo` may be, or that were removed; `others`: log -> ids of what is new in it though its name was known."""
 
     todo: list[Planned] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
@@ -77,6 +75,7 @@ class Plan:
     notes: list[str] = field(default_factory=list)
     rate_hz: float | None = None
     known: dict[str, tuple[KnownContent, ...]] = field(default_factory=dict)
+    others: dict[Path, list[str]] = field(default_factory=dict)
 
 
 def make_plan(
@@ -90,13 +89,17 @@ def make_plan(
     again: bool = False,
 ) -> Plan:
     """Compare logs with the store. What was removed on purpose stays out, unless it is wanted `again`. Raises UsageError where the
-    dataset is of another task, or where episodes ingested by another spec would stay in it."""
+    dataset is of another task, cut by another rule, or where episodes ingested by another spec would stay in it."""
     plan, fields = Plan(), spec.ingest_fields()
     present, removed = {entry.id: entry for entry in store.index()}, read_removed(store.root)
     _refuse_another_task(store, spec, present)
+    _refuse_another_rule(store, fields, present)
     sources = read_sources(logs, spec, cache, known_cuts(present.values(), removed))
     plan.failed, plan.notes = sources.failed, sources.notes
-    for source, episode_id in identify(sources, list(present.values()), plan, removed):
+    removed = {id: one for id, one in removed.items() if id not in present}  # a killed ingest had brought it back
+    identified = identify(sources, list(present.values()), plan, removed)
+    unclaimed = [present[id] for id in sorted(present.keys() - {id for _, id in identified})]
+    for source, episode_id in identified:
         entry, gone = present.get(episode_id), removed.get(episode_id)
         if entry is None and gone is not None and not again:
             plan.removed.append(episode_id)
@@ -104,24 +107,34 @@ def make_plan(
         edits = _edits_to_keep(episode_id, entry or gone, source, plan)
         if entry is not None and _is_fresh(store, entry, source, fields):
             plan.fresh.append(episode_id)
-            plan.notes += _restate(entry, source, plan, spec)
-        elif is_rollout(source.demonstration.tags) and not with_rollouts:
-            plan.rollouts.append(episode_id)
-        elif not include_failures and _failed(source, edits):
-            plan.left_out.append(episode_id)
+            today, notes = told_today(entry, source, spec)
+            plan.restated += [today] * (today != entry)
+            plan.notes += notes
+            continue
+        is_new, unwanted = entry is None and gone is None, None
+        if entry is None:
+            unwanted = _unwanted(source, edits, include_failures=include_failures, with_rollouts=with_rollouts)
         else:
-            key = episode_key(
-                source_sha256=source.sha256, source_episode=source.demonstration.name, ingest_fields=fields
-            )
-            plan.todo.append(Planned(episode_id, source, key, edits, is_new=entry is None and gone is None))
+            same_spec = first_difference(entry.ingest, fields) is None
+            plan.replaced |= {episode_id} if same_spec and held_of(entry.cut) != source.held else set()
+            plan.notes += [failure_note(episode_id)] * (_failed(source, edits) and entry.outcome != "failure")
+        may_be = written_anew(source, sources.found, unclaimed) if is_new else frozenset()
+        if unwanted is not None and not may_be:
+            (plan.left_out if unwanted == "left_out" else plan.rollouts).append(episode_id)
+            continue
+        key = episode_key(
+            source_sha256=source.key_sha256, source_episode=source.demonstration.name, ingest_fields=fields
+        )
+        plan.todo.append(Planned(episode_id, source, key, edits, is_new, may_be, unwanted))
     settled = {*plan.fresh, *(planned.id for planned in plan.todo)}
     staying = [entry for entry in present.values() if entry.id not in settled]
     plan.notes += _no_longer_cut(sources.found, staying, spec)
     _refuse_another_spec(store, staying, fields)
-    plan.replaced &= {planned.id for planned in plan.todo}
     plan.rate_hz = next((entry.rate_hz for entry in present.values() if entry.ingest == fields), None)
-    at_rest = present.keys() - {planned.id for planned in plan.todo}
-    plan.known = known_contents([present[id] for id in sorted(at_rest)], removed)
+    candidates = frozenset[str]().union(*(planned.may_be for planned in plan.todo))
+    plan.known = known_contents(
+        [present[id] for id in sorted(candidates)], {id: one for id, one in removed.items() if id not in settled}
+    )
     return plan
 
 
@@ -132,39 +145,26 @@ def known_cuts(entries: Iterable[EpisodeEntry], removed: Removed) -> list[KnownC
     return [KnownCut(id, log, sha256, cut) for id, log, sha256, table in rows if (cut := Cut.from_json(table))]
 
 
-def known_contents(entries: Iterable[EpisodeEntry], removed: Removed) -> dict[str, tuple[KnownContent, ...]]:
-    """Content hash, as ingest gives it -> what is known to show that."""
-    found: dict[str, tuple[KnownContent, ...]] = {}
-    for entry in entries:
-        one = KnownContent(entry.id, entry.first_step)
-        found[entry.ingest_content] = (*found.get(entry.ingest_content, ()), one)
-    for id, gone in removed.items():
-        step = int(gone.edits.get("trim", {}).get("first_step", 0))
-        one = KnownContent(id, step, gone.tick_ns, edits_of(gone.edits))
-        found[gone.ingest_content] = (*found.get(gone.ingest_content, ()), one)
-    return found
-
-
 def identify(
     sources: Sources, entries: Sequence[EpisodeEntry], plan: Plan, removed: Removed | None = None
 ) -> list[tuple[Source, str]]:
-    """The episode id of each source, by the rule above; fills `plan.replaced` and `plan.notes`. What was removed keeps its id."""
+    """The episode id of each source, by the rule above; fills `plan.replaced` and `plan.others`. What was removed keeps its id."""
     removed = removed or {}
-    by_hash = {episode.source_sha256: id for id, episode in removed.items()}
-    by_hash |= {entry.source_sha256: entry.id for entry in entries}
-    claimed = {by_hash[source.sha256] for source in sources.found if source.sha256 in by_hash}
+    by_bytes = _known_by_bytes(sources.found, entries, removed)
+    claimed = set(by_bytes.values())
     taken = {*removed, *(entry.id for entry in entries)}
     found: list[tuple[Source, str]] = []
     for log, group in groupby(sources.found, key=lambda source: source.log):
         members = list(group)
         unclaimed = [entry for entry in entries if entry.source == log.name and entry.id not in claimed]
+        unknown = [source for source in members if source.made_of not in by_bytes]
         replaceable = _replaceable(members, entries, unclaimed)
-        replaceable |= _overlapped(members, [one for one in sources.held.get(log, ()) if one.id not in claimed])
+        replaceable |= _overlapped(unknown, [one for one in sources.held.get(log, ()) if one.id not in claimed])
         new: list[str] = []
         for source in members:
             name = source.demonstration.name
-            if source.sha256 in by_hash:
-                episode_id = by_hash[source.sha256]
+            if source.made_of in by_bytes:
+                episode_id = by_bytes[source.made_of]
             elif name in replaceable:
                 episode_id = replaceable[name]
                 plan.replaced |= {episode_id} - removed.keys()
@@ -173,37 +173,61 @@ def identify(
                 new.append(episode_id)
             taken.add(episode_id)
             found.append((source, episode_id))
-        known = any(source.sha256 in by_hash or source.demonstration.name in replaceable for source in members)
-        if new and unclaimed and not known:
-            ids = new[0] if len(new) == 1 else f"{new[0]} and {len(new) - 1} more"
-            plan.notes.append(f"{log}: not the {log.name} ingested before; both are kept, this one as {ids}")
+        if unclaimed and len(new) == len(members):
+            plan.others[log] = new
     return found
+
+
+def _known_by_bytes(
+    found: Sequence[Source], entries: Sequence[EpisodeEntry], removed: Removed
+) -> dict[tuple[str, str], str]:
+    """What a source is made of -> the known episode that is made of that, else one of the same messages, before which others came."""
+    rows = [(id, one.source_sha256, held_of(one.cut)) for id, one in removed.items()]
+    rows += [(entry.id, entry.source_sha256, held_of(entry.cut)) for entry in entries]
+    exactly = {(sha256, held): id for id, sha256, held in rows}
+    known = {source.made_of: exactly[source.made_of] for source in found if source.made_of in exactly}
+    rest: dict[str, list[str]] = {}
+    for id, sha256, _ in rows:
+        if id not in known.values():
+            rest.setdefault(sha256, []).append(id)
+    for source in found:
+        if source.made_of not in known and rest.get(source.sha256):
+            known[source.made_of] = rest[source.sha256].pop()
+    return known
 
 
 def _is_fresh(store: EpisodeStore, entry: EpisodeEntry, source: Source, fields: Mapping[str, object]) -> bool:
     """Whether the store holds just what an ingest of the source would give today."""
-    same = entry.source_sha256 == source.sha256 and first_difference(entry.ingest, fields) is None
-    return same and store.frames_fit(entry)
+    made_of = entry.source_sha256, held_of(entry.cut)
+    return made_of == source.made_of and first_difference(entry.ingest, fields) is None and store.frames_fit(entry)
 
 
-def _restate(entry: EpisodeEntry, source: Source, plan: Plan, spec: TaskSpec) -> list[str]:
-    """What the task says of a stored cut today goes into `plan.restated`; what it means, in words. The name of its log stays: of the same
-    bytes under two names none is righter."""
-    if source.cut is None:
-        return []
-    tags, name = dict(source.demonstration.tags), source.demonstration.name
-    tags |= {LOG_TAG: entry.tags[LOG_TAG]} if LOG_TAG in entry.tags else {}
-    today = replace(restated(entry, tags), source_episode=name)
-    if today == entry:
-        return []
-    plan.restated.append(today)
-    notes = []
+def told_today(entry: EpisodeEntry, source: Source, spec: TaskSpec) -> tuple[EpisodeEntry, list[str]]:
+    """The entry of a stored episode with what its log and the task say of it today; what that means, in words. The name of a cut's log
+    stays: of the same bytes under two names none is righter."""
+    tags, name = dict(source.demonstration.tags), entry.source_episode
+    if source.cut is not None:
+        name = source.demonstration.name
+        tags |= {LOG_TAG: entry.tags[LOG_TAG]} if LOG_TAG in entry.tags else {}
+    today, notes = replace(restated(entry, tags), source_episode=name), []
     if name != entry.source_episode:
         notes.append(f"{entry.id}: called {name} in {spec.episodes.by} now; the episode keeps its id")
     if today.outcome == "failure" != entry.outcome:
-        notes.append(
-            f"{entry.id}: a failure now, and still stored; `vilp-data remove {entry.id}` takes it out of training"
-        )
+        notes.append(failure_note(entry.id))
+    return today, notes
+
+
+def failure_note(id: str) -> str:
+    return f"{id}: a failure now, and still stored; `vilp-data remove {id}` takes it out of training"
+
+
+def notes_on_others(plan: Plan, written: Collection[str]) -> list[str]:
+    """About logs whose name was known, and of which something was stored beside what came from that name before."""
+    notes = []
+    for log, new in plan.others.items():
+        if kept := [id for id in new if id in written]:
+            ids = kept[0] if len(kept) == 1 else f"{kept[0]} and {len(kept) - 1} more"
+            notes.append(f"{log}: not the {log.name} ingested before; both are kept, this one as {ids}")
     return notes
 
 
@@ -228,6 +252,12 @@ def _edits_to_keep(id: str, known: EpisodeEntry | RemovedEpisode | None, source:
     return replace(edits, start_ns=None, end_ns=None) if cut_otherwise else None
 
 
+def _unwanted(source: Source, edits: Edits | None, *, include_failures: bool, with_rollouts: bool) -> Unwanted | None:
+    if is_rollout(source.demonstration.tags) and not with_rollouts:
+        return "rollouts"
+    return "left_out" if _failed(source, edits) and not include_failures else None
+
+
 def _failed(source: Source, edits: Edits | None) -> bool:
     """Whether the log says that the demonstration failed, and no label says otherwise."""
     return outcome_of(source.demonstration.tags) == "failure" and not (edits and edits.calls_it_no_failure)
@@ -237,10 +267,9 @@ def _replaceable(
     members: Sequence[Source], entries: Sequence[EpisodeEntry], unclaimed: Sequence[EpisodeEntry]
 ) -> dict[str, str]:
     """Demonstration name -> the episode it replaces, where `members` are the same log grown or edited; else nothing."""
-    hashes = {source.sha256 for source in members}
-    same_name = [entry for entry in entries if entry.source == members[0].log.name]
-    kept = sum(entry.source_sha256 in hashes for entry in same_name)
-    if members[0].alone or members[0].cut is not None or kept == 0 or 2 * kept < len(same_name):
+    known = {entry.source_episode for entry in entries if entry.source == members[0].log.name}
+    changed = {entry.source_episode for entry in unclaimed}  # one that was stored beside such a one is of another log
+    if members[0].alone or members[0].cut is not None or known == changed or 2 * len(known - changed) < len(known):
         return {}
     return {entry.source_episode: entry.id for entry in unclaimed}
 
@@ -294,6 +323,26 @@ def _refuse_another_task(store: EpisodeStore, spec: TaskSpec, present: Mapping[s
         )
 
 
+def _refuse_another_rule(
+    store: EpisodeStore, fields: Mapping[str, object], present: Mapping[str, EpisodeEntry]
+) -> None:
+    """Cut by another rule, demonstrations are others, with names, labels and sides of their own: whether each of them happens to lie over
+    a stored one must not decide whether they take the place of these."""
+    for entry in present.values():
+        difference = first_difference(_rule_of(entry.ingest), _rule_of(fields))
+        if difference is not None:
+            raise UsageError(
+                "the dataset's demonstrations are cut out of their logs by another rule",
+                where=store.root,
+                found=f"{difference} ({entry.id} of {entry.source})",
+                remedy="another rule makes another dataset: name another folder with --into, or delete this one first",
+            )
+
+
+def _rule_of(fields: Mapping[str, object]) -> dict[str, object]:
+    return {name: value for name, value in fields.items() if name == "episodes"}
+
+
 def _refuse_another_spec(store: EpisodeStore, staying: Sequence[EpisodeEntry], fields: Mapping[str, object]) -> None:
     compared = [(entry, first_difference(entry.ingest, fields)) for entry in staying]
     differing = [(entry, difference) for entry, difference in compared if difference is not None]
@@ -303,7 +352,5 @@ def _refuse_another_spec(store: EpisodeStore, staying: Sequence[EpisodeEntry], f
             "one dataset cannot hold episodes of two specs",
             where=store.root,
             found=f"{difference} ({entry.id} of {entry.source}, one of {len(differing)} that would stay as they are)",
-            remedy="name another folder with --into, or take out what is cut otherwise now (`vilp-data remove`; all of it: the folder)"
-            if difference.startswith("episodes")
-            else "give the logs of all its episodes, to ingest them anew, or name another folder with --into",
+            remedy="give the logs of all its episodes, to ingest them anew, or name another folder with --into",
         )

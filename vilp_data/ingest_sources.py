@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -10,28 +10,49 @@ from typing import Any
 
 from vilp_data.cut_identity import Cut, cut_sha256
 from vilp_data.cut_log import cut_log
-from vilp_data.errors import DecodeError, LogError, SpecError
+from vilp_data.errors import DecodeError, LogError, SpecError, some_of
+from vilp_data.held_messages import held_sha256
+from vilp_data.keys import digest
 from vilp_data.log_hashes import HashCache
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import LogEpisode
 
+HELD = "held"
+"""Where `EpisodeEntry.cut` says what a cut was made of besides its own messages."""
+
+
+def held_of(cut: Mapping[str, Any]) -> str:
+    """As `Source.held`, of an episode's `cut`."""
+    return str(cut.get(HELD, ""))
+
 
 @dataclass(frozen=True)
 class Source:
     """One demonstration of one log, before it is known which episode it is. `alone`: its log holds no other. `cut`: where it was cut out
-    of its log, None for a log's own."""
+    of its log, None for a log's own. `held`: SHA-256 of what a cut is made of besides its own messages, "" where that is nothing."""
 
     log: Path
     demonstration: LogEpisode
     sha256: str
     alone: bool
     cut: Cut | None = None
+    held: str = ""
+
+    @property
+    def made_of(self) -> tuple[str, str]:
+        """All that an ingest of it takes in: its own bytes, and what holds in it from before."""
+        return self.sha256, self.held
+
+    @property
+    def key_sha256(self) -> str:
+        """What its key depends on."""
+        return digest(self.made_of) if self.held else self.sha256
 
     @property
     def place(self) -> dict[str, Any]:
         """What `EpisodeEntry.cut` says of it."""
-        return self.cut.to_json() if self.cut is not None else {}
+        return {} if self.cut is None else self.cut.to_json() | ({HELD: self.held} if self.held else {})
 
 
 @dataclass(frozen=True)
@@ -46,9 +67,9 @@ class KnownCut:
 
 @dataclass
 class Sources:
-    """`found` in order of logs, those with the same bytes once. `held`: log -> the known cuts that it holds though its demonstrations are
-    others now: those that it holds unchanged; and the others too where these are at least half of what is known by its name, so that
-    it is the same log, edited. Logs that cannot be read (name, why); sentences about the rest."""
+    """`found` in order of the logs' names, what is made of the same bytes once. `held`: log -> the known cuts that it holds though its
+    demonstrations are others now: those that it holds unchanged; and the others too where these are at least half of what is known by
+    its name, so that it is the same log, edited. Logs that cannot be read (name, why); sentences about the rest."""
 
     found: list[Source] = field(default_factory=list)
     held: dict[Path, list[KnownCut]] = field(default_factory=dict)
@@ -57,9 +78,9 @@ class Sources:
 
 
 def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, known: Sequence[KnownCut] = ()) -> Sources:
-    """Every demonstration of the logs. Reads them as far as the cache does not know them."""
-    sources, by_hash = Sources(), dict[str, Source]()
-    for path in logs:
+    """Every demonstration of the logs, in whatever order these are given. Reads them as far as the cache does not know them."""
+    sources, by_bytes, copies = Sources(), dict[tuple[str, str], Source](), list[tuple[Source, Source]]()
+    for path in sorted(logs, key=lambda path: (path.name, str(path))):
         try:
             with open_log(path, array_rate_hz=spec.rate_hz or 10.0) as log:
                 found, held, notes = _read_log(log, path, spec, cache, [one for one in known if one.log == path.name])
@@ -69,12 +90,12 @@ def read_sources(logs: Sequence[Path], spec: TaskSpec, cache: HashCache, known: 
         sources.held[path] = held
         sources.notes += notes
         for source in found:
-            first = by_hash.setdefault(source.sha256, source)
+            first = by_bytes.setdefault(source.made_of, source)
             if first is source:
                 sources.found.append(source)
             else:
-                copied = "" if first.alone else f", {first.demonstration.name}"
-                sources.notes.append(f"{path}: a copy of {first.log}{copied}, byte for byte; taken once")
+                copies.append((source, first))
+    sources.notes += _about_copies(copies)
     return sources
 
 
@@ -97,13 +118,44 @@ def _read_log(
     found = []
     for one in demonstrations:
         cut = Cut(one.start_ns, one.end_ns, topics)
-        sha256 = cut_sha256(log, cut, hashes[cuts.native[one.name]], remember)
-        found.append(Source(path, one, sha256, alone=False, cut=cut))
+        native = hashes[cuts.native[one.name]]
+        sha256, held = cut_sha256(log, cut, native, remember), held_sha256(log, one, spec, native, remember)
+        found.append(Source(path, one, sha256, alone=False, cut=cut, held=held))
     today = {source.sha256 for source in found}
     others = [one for one in known if one.sha256 not in today]
-    held = [one for one in others if _holds(log, natives, hashes, one, remember)]
-    unchanged = len(known) - len(others) + len(held)
-    return found, others if 0 < len(known) <= 2 * unchanged else held, notes
+    still = [one for one in others if _holds(log, natives, hashes, one, remember)]
+    return found, others if _is_same_log(known, others, still) else still, notes
+
+
+def _is_same_log(known: Sequence[KnownCut], others: Sequence[KnownCut], still: Sequence[KnownCut]) -> bool:
+    """Whether at least half of what is known by a log's name is unchanged in it. What lies over a known cut that is not was stored beside
+    it, so it is of another log of that name, and does not count: else an ingest that was killed would go on otherwise than it began."""
+    gone = [one for one in others if one not in still]
+    unchanged = [
+        one for one in known if one not in gone and not any(one.cut.overlap_ns(other.cut) > 0 for other in gone)
+    ]
+    return 0 < len(unchanged) >= len(gone)
+
+
+def _about_copies(copies: Sequence[tuple[Source, Source]]) -> Iterator[str]:
+    """A sentence about what each log was copied to, however many demonstrations and logs that is."""
+    of: dict[tuple[Path, str], list[tuple[Source, Source]]] = {}
+    for source, first in copies:
+        of.setdefault((first.log, _likeness(source)), []).append((source, first))
+    for (log, likeness), pairs in of.items():
+        what = f"{_named(pairs[0][0])}: a copy of {_named(pairs[0][1])}"
+        if len(pairs) > 1:
+            logs = some_of(list(dict.fromkeys(str(source.log) for source, _ in pairs)), 3)
+            what = f"{logs}: {len(pairs)} copies of what {log} holds"
+        yield f"{what}, {likeness}; taken once"
+
+
+def _named(source: Source) -> str:
+    return str(source.log) if source.alone else f"{source.log}, {source.demonstration.name}"
+
+
+def _likeness(source: Source) -> str:
+    return "byte for byte" if source.alone else "row for row" if source.cut is None else "message for message"
 
 
 def _holds(

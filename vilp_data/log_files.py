@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vilp_data.errors import LogError, UsageError, salvage_command, some_of
+from vilp_data.locate import a_dataset, has_been_dataset
 from vilp_data.sources.lerobot_meta import is_lerobot
 from vilp_data.sources.rosbag2_metadata import is_bag_folder, lone_file, read_metadata
 from vilp_data.sources.zarr_log import is_zarr
@@ -56,6 +57,11 @@ def is_one_log(folder: Path) -> bool:
 
 
 def _no_logs(folder: Path, others: list[Path]) -> UsageError:
+    if has_been_dataset(folder):
+        return a_dataset(folder)
+    if (folder / ".lock").is_file():
+        remedy = "run the same `vilp-data ingest` again, or delete the folder"
+        return UsageError("a dataset that holds no episode yet: its ingest was stopped", where=folder, remedy=remedy)
     left_open = [other for other in others if other.name.lower().endswith(OTHER_LOGS)]
     if left_open:
         remedy = f"{salvage_command(left_open[0])} closes what a recorder left open"

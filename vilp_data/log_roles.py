@@ -69,8 +69,10 @@ def _role(log: IndexedLog, topic: TopicSummary) -> TopicRole:
     if not messages:
         return TopicRole(topic.name, "unused", "its first messages cannot be found")
     role = role_of(topic.name, messages)
-    if role.kind == "camera" and topic.rate_hz is None:
+    if role.kind not in ("unused", "transforms") and topic.n_messages is not None and topic.n_messages < 2:
         return TopicRole(topic.name, "unused", f"{role.why}, but one message only")
+    if role.kind == "camera" and topic.rate_hz is None:
+        return TopicRole(topic.name, "unused", f"{role.why}, but all at one time")
     if role.kind == "transforms" and role.reference_frames and not topic.name.endswith(STATIC):
         from_to, frames = _frame_pair(log, topic.name, messages)
         return replace(role, from_to=from_to, reference_frames=frames)

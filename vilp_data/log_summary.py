@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,14 @@ from vilp_data.decode import decode_image, header_time_ns, image_encoding, is_im
 from vilp_data.decode.depth import is_depth, is_grey16, measured_depth
 from vilp_data.decode.video import VideoDecoder
 from vilp_data.decode.video_packet import is_video, video_codec
-from vilp_data.errors import VilpDataError
+from vilp_data.errors import VilpDataError, number_of
+from vilp_data.message_rate import keeps_rate, rate_by_count
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.sources.folder_hash import log_files
 from vilp_data.types import I64, Message, TopicInfo
 
 SAMPLED = 20  # messages of a topic that are decoded
+MOST_TOPICS = 60  # beyond it topics of one message are only counted in the terminal
 FAR_APART_S = 1.0  # a header this far from the log time is worth a word
 SHOWN_METADATA = 60  # characters of a metadata value in the terminal
 RELATIVE = ("hdf5", "lerobot")  # formats that count time from the first demonstration's start
@@ -35,7 +37,8 @@ class TopicSummary:
     """One topic. Figures that nothing tells are None: `note` then says why.
 
     n_messages      from the log's statistics
-    rate_hz         1 / median interval of log times; max_gap_s the longest interval, backward_jumps how often log time fell
+    rate_hz         1 / median interval of log times; of a topic that comes on events or in bursts, messages over the log's duration
+    max_gap_s       the longest interval; backward_jumps how often log time fell
     image           `96x160 jpeg` for image topics, from the first image
     header_clock    "none", "wall", "simulated" (starting before the year 2000) or "zero" (stamps left unset)
     header_lag_s    median of log time minus header stamp over the first messages; positive where the recorder came later
@@ -88,39 +91,41 @@ def summarise(path: Path, *, array_rate_hz: float = 10.0) -> LogSummary:
     with open_log(path, array_rate_hz=array_rate_hz) as log:
         times, complete = log.message_times()
         episodes = log.episodes()
-        topics = tuple(_topic(log, topic, times.get(topic.name)) for topic in log.topics())
         start_ns = episodes[0].start_ns if episodes else None
-        duration_s = (episodes[-1].end_ns - episodes[0].start_ns) / 1e9 if episodes else 0.0
+        duration_s = (max(episode.end_ns for episode in episodes) - episodes[0].start_ns) / 1e9 if episodes else 0.0
+        covered_s = duration_s if complete or start_ns is None else _covered_s(times, start_ns)
+        starts_ns = np.array([episode.start_ns for episode in episodes], np.int64)
+        topics = tuple(_topic(log, topic, times.get(topic.name), covered_s, starts_ns) for topic in log.topics())
         assumed_rate_hz = getattr(log, "assumed_rate_hz", None)
         return LogSummary(
             path=str(path),
             format=log.format,
             size_bytes=_size(path),
             n_episodes=len(episodes),
-            n_whole=getattr(log, "n_whole", None),
+            n_whole=None if (whole := getattr(log, "whole", None)) is None else len(whole),
             start_ns=start_ns,
             duration_s=duration_s,
             log_clock=_log_clock(log.format, start_ns, assumed_rate_hz),
             assumed_rate_hz=assumed_rate_hz,
             topics=topics,
             metadata=log.metadata(),
-            sampled=_sampled(complete, times, start_ns),
+            sampled=_sampled(complete, covered_s),
             doubts=tuple(log.doubts()),
         )
 
 
-def _sampled(complete: bool, times: dict[str, I64], start_ns: int | None) -> tuple[str, ...]:
+def _covered_s(times: dict[str, I64], start_ns: int) -> float:
+    """How much of a log the times of its first part cover."""
+    return (max((int(values.max()) for values in times.values() if len(values)), default=start_ns) - start_ns) / 1e9
+
+
+def _sampled(complete: bool, covered_s: float) -> tuple[str, ...]:
     columns = f"image and header columns: the first {SAMPLED} messages of each topic at most"
-    if complete or start_ns is None:
-        return (columns,)
-    covered_s = (
-        max((int(values.max()) for values in times.values() if len(values)), default=start_ns) - start_ns
-    ) / 1e9
-    return (f"rates and gaps: the first {covered_s:.0f} s", columns)
+    return (columns,) if complete else (f"rates and gaps: the first {covered_s:.0f} s", columns)
 
 
-def _topic(log: IndexedLog, topic: TopicInfo, times: I64 | None) -> TopicSummary:
-    rate_hz, max_gap_s, jumps = _intervals(times)
+def _topic(log: IndexedLog, topic: TopicInfo, times: I64 | None, covered_s: float, starts_ns: I64) -> TopicSummary:
+    rate_hz, max_gap_s, jumps = _intervals(times, covered_s, starts_ns)
     image = clock = lag_s = note = None
     if times is None and topic.message_count:
         note = "no message index: rate not known without reading the log"
@@ -146,14 +151,17 @@ def _topic(log: IndexedLog, topic: TopicInfo, times: I64 | None) -> TopicSummary
     )
 
 
-def _intervals(times: I64 | None) -> tuple[float | None, float | None, int | None]:
-    """(rate, longest gap, backward jumps) of log times in file order; no rate below two messages."""
+def _intervals(times: I64 | None, covered_s: float, starts_ns: I64) -> tuple[float | None, float | None, int | None]:
+    """(rate, longest gap, backward jumps) of log times in file order, which cover so much time; no rate below two messages. What lies
+    between two demonstrations, which begin at `starts_ns`, is no gap."""
     if times is None or len(times) < 2:
         return None, None, None if times is None else 0
     jumps = int((np.diff(times) < 0).sum())
-    gaps_s = np.diff(np.sort(times)) / 1e9
-    median_s = float(np.median(gaps_s))
-    return 1 / median_s if median_s > 0 else None, float(gaps_s.max()), jumps
+    stamps = np.sort(times)
+    within = np.diff(np.searchsorted(starts_ns, stamps, side="right")) == 0
+    gaps_s = np.diff(stamps)[within] / 1e9
+    rate_hz = 1 / float(np.median(gaps_s)) if keeps_rate(gaps_s) else rate_by_count(len(times), covered_s)
+    return rate_hz, float(gaps_s.max()) if len(gaps_s) else None, jumps
 
 
 def _image(messages: list[Message]) -> str | None:
@@ -210,18 +218,28 @@ def _size(path: Path) -> int:
 def format_summary(summary: LogSummary) -> str:
     """The summary as a table for the terminal, warnings about clocks below it."""
     duration = f"{summary.duration_s:.2f} s"
-    episodes = f"{summary.n_episodes} episode{'' if summary.n_episodes == 1 else 's'}"
+    episodes = number_of(summary.n_episodes, "episode")
     if summary.n_whole not in (None, summary.n_episodes):
         episodes, duration = f"{summary.n_whole} of {episodes} have all their files", f"{duration} listed"
     start = "" if summary.start_ns is None else f", from {summary.start_ns} ns ({CLOCKS[summary.log_clock]})"
     size = f"{summary.size_bytes / 1e6:.1f} MB"
     lines = [f"{summary.path}: {summary.format}, {size}, {episodes}, {duration}{start}", ""]
     head = ("topic", "schema", "encoding", "messages", "rate Hz", "max gap s", "image", "header clock", "lag s")
-    lines += _table([head, *(_row(topic) for topic in summary.topics)])
+    shown = _shown(summary.topics)
+    lines += _table([head, *(_row(topic) for topic in shown)])
+    if folded := len(summary.topics) - len(shown):
+        lines.append(f"and {number_of(folded, 'topic')} of one message or none (--json lists them)")
     lines += _section("Worth knowing", _warnings(summary))
     lines += _section("Metadata", _metadata_lines(summary.metadata))
     lines += _section("From a sample", summary.sampled)
     return "\n".join(lines)
+
+
+def _shown(topics: Sequence[TopicSummary]) -> Sequence[TopicSummary]:
+    """All of them; of very many only those that say something more than once, where there are such."""
+    if len(topics) <= MOST_TOPICS:
+        return topics
+    return [topic for topic in topics if topic.n_messages is None or topic.n_messages > 1] or topics[:MOST_TOPICS]
 
 
 def _row(topic: TopicSummary) -> tuple[str, ...]:

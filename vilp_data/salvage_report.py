@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from vilp_data.errors import number_of
+
 SHOWN_PLACES = 12
 
 
@@ -87,7 +89,7 @@ class SalvageReport:
 
     def lose(self, begin: int, end: int, what: str, *, messages: bool = True) -> None:
         """Bytes that gave nothing, and may have held messages (or else `messages` is False): behind the log's end there are none."""
-        self.skip(begin, end, what)
+        self.skip(begin, end, f"{what}; behind the last message, where a log keeps none" if self.ended else what)
         if messages and not self.ended:
             self.amount_known = False
             self.doubt("bytes are missing or unreadable where the log keeps its messages")
@@ -107,9 +109,7 @@ class SalvageReport:
         for topic in self.topics.values():
             expected = None if self.expected is None else self.expected.get(topic.name, 0)
             if expected is not None and topic.recovered > expected:
-                surplus = (
-                    f"{topic.name}: {topic.recovered:,} messages where the log's own statistics count {expected:,}"
-                )
+                surplus = f"{topic.name}: {number_of(topic.recovered, 'message')} where the log's own statistics count {expected:,}"
                 self.doubt(surplus)
             if expected is not None and expected >= topic.recovered:
                 topic.lost = topic.known_lost = expected - topic.recovered
@@ -167,7 +167,7 @@ def format_report(report: SalvageReport) -> str:
 
 
 def _lines(report: SalvageReport) -> Iterable[str]:
-    found = f"{report.recovered:,} messages"
+    found = number_of(report.recovered, "message")
     if report.whole:
         yield f"{report.output}: {report.source} is whole ({found}); copied as it is" + (
             "" if report.format == "mcap" else ", into MCAP"
@@ -186,12 +186,12 @@ def _lines(report: SalvageReport) -> Iterable[str]:
     if any(others):
         yield "  beside messages: " + ", ".join(other for other in others if other)
     if report.suspicious:
-        yield f"  {report.suspicious:,} messages are suspicious: they fit their place, but a checksum over them fails;"
+        yield f"  suspicious: {number_of(report.suspicious, 'message')} in place, over which a checksum fails;"
         yield "    --drop-suspicious leaves them out"
     if report.unverified:
-        yield f"  {report.unverified:,} messages are not covered by any checksum: nothing vouches for their bytes"
+        yield f"  covered by no checksum: {number_of(report.unverified, 'message')}, for whose bytes nothing vouches"
     if report.suspicious_left_out:
-        yield f"  {report.suspicious_left_out:,} messages left out, since a checksum over them fails"
+        yield f"  left out, since a checksum over them fails: {number_of(report.suspicious_left_out, 'message')}"
     if report.skipped:
         yield f"  {report.skipped_bytes:,} of {report.size_bytes:,} bytes gave nothing:"
         for place in report.skipped[:SHOWN_PLACES]:
@@ -211,7 +211,7 @@ def _loss(report: SalvageReport) -> str:
 
 
 def _count(number: int, what: str, more: str = "") -> str:
-    return f"{number:,} {what}{'' if number == 1 else 's'}{more}" if number else ""
+    return number_of(number, what) + more if number else ""
 
 
 def _table(topics: Iterable[TopicLoss]) -> Iterable[str]:

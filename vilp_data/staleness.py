@@ -30,9 +30,8 @@ def stale_episodes(root: Path, spec: TaskSpec) -> dict[str, str]:
         difference = first_difference(entry.ingest, fields)
         if difference is not None:
             way = f"run `vilp-data ingest` on {entry.source} again"
-            way += "; what it does not cut out any more, `vilp-data remove` takes out" * difference.startswith(
-                "episodes"
-            )
+            if difference.startswith("episodes"):
+                way = f"another rule makes another dataset: `vilp-data ingest` {entry.source} --into another folder"
             reasons[entry.id] = f"{difference}; {way}"
     return reasons
 

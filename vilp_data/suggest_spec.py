@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ ONE_CLOCK_S = 1.0
 
 LONGEST_LIST = 16  # topics of no use that are named
 FASTEST_HZ = 30.0  # for a task without cameras
+DULL_WORDS = ("observation", "obs", "msg", "data")  # of a topic's name
 SLOW_HZ = 5.0  # below it the usual stale_after_s would mask half of the steps
 CAMERA_WORDS = {
     *(
@@ -54,7 +56,7 @@ def suggest_spec(path: Path, *, name: str | None = None) -> str:
             "no camera and no numbers that a task could read", where=path, found=found, remedy="name another log"
         )
     clocks = _clocks(look)
-    names = _Names()
+    names = _Names(role.topic for role in (*look.states, *look.others, *look.commands))
     low_dim, parts = _low_dim_lines(look, clocks, names)
     lines = [
         f"# A task for {path.name}, suggested by `vilp-data inspect --suggest-spec`.",
@@ -77,10 +79,14 @@ def suggest_spec(path: Path, *, name: str | None = None) -> str:
 
 
 class _Names:
-    """Names that were not given yet."""
+    """Names that were not given yet, for parts of low_dim and action whose topics these are, and for views."""
 
-    def __init__(self) -> None:
+    def __init__(self, topics: Iterable[str]) -> None:
         self._given: set[str] = set()
+        self._parts = _part_names(list(topics))
+
+    def part(self, topic: str) -> str:
+        return self.new(self._parts[topic])
 
     def new(self, wanted: str) -> str:
         base, number = _plain(wanted) or "part", 2
@@ -95,10 +101,22 @@ def _plain(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_-")
 
 
-def _part_name(topic: str) -> str:
-    """`/left/joint_states` is left_joint_states; words that say nothing are left out."""
-    words = [word for word in words_of(topic) if word not in ("observation", "obs", "msg", "data")]
-    return "_".join(words[-3:])
+def _part_names(topics: Sequence[str]) -> dict[str, str]:
+    """`/left/joint_states` is left_joint_states; words that say nothing are left out, and the last three are taken. Where several topics
+    end alike, a name is of the words that they do not share, with the end behind them where even that does not tell them apart."""
+    words = {topic: [word for word in words_of(topic) if word not in DULL_WORDS] for topic in topics}
+    ends = {topic: "_".join(words[topic][-3:]) for topic in topics}
+    alike: dict[str, list[str]] = {}
+    for topic, end in ends.items():
+        alike.setdefault(end, []).append(topic)
+    names = dict(ends)
+    for group in alike.values():
+        shared = set.intersection(*(set(words[topic]) for topic in group)) if len(group) > 1 else set()
+        names |= {
+            topic: "_".join(w for w in words[topic] if w not in shared) or ends[topic] for topic in group if shared
+        }
+    given = Counter(names.values())
+    return {topic: name if given[name] == 1 else f"{name}_{ends[topic]}" for topic, name in names.items()}
 
 
 def _view_name(topic: str) -> str:
@@ -196,7 +214,7 @@ def _low_dim_lines(look: LogRoles, clocks: dict[str, tuple[str, str]], names: _N
     for role in (*look.states, *look.others[:LONGEST_LIST]):
         hidden = "" if role in look.states else "# "
         for group in role.name_groups or ((),):
-            part = names.new(_part_name(role.topic))
+            part = names.part(role.topic)
             lines.append(f"{hidden}low_dim.{part} = {_entry(look, role, clocks, group)}  # {_why(role, clocks)}")
             given += [] if hidden else [part]
     for role in look.transforms[:LONGEST_LIST]:
@@ -221,7 +239,7 @@ def _action_lines(look: LogRoles, clocks: dict[str, tuple[str, str]], names: _Na
         delta = ', kind = "delta"' if set(words_of(role.topic)) & {"delta", "dpos", "deltas"} else ""
         for group in role.name_groups or ((),):
             entry = _entry(look, role, clocks, group, held=True)[:-2] + delta + " }"
-            lines.append(f"{hidden}action.{names.new(_part_name(role.topic))} = {entry}  # {_why(role, clocks)}")
+            lines.append(f"{hidden}action.{names.part(role.topic)} = {entry}  # {_why(role, clocks)}")
     for part in parts if not sure else ():
         lines.append(
             f'# action.{names.new(part + "_next")} = {{ from = "{part}", shift = 1 }}  # the state one step later'
@@ -231,7 +249,8 @@ def _action_lines(look: LogRoles, clocks: dict[str, tuple[str, str]], names: _Na
     elif look.commands:
         head = "Un-comment the topics that the robot obeyed; without any, episodes are only watched."
     elif lines:
-        head = "No topic is called like a command: un-comment a line to take the state one step later for it."
+        head = "No topic is called like a command: un-comment a line to take the state one step later for it, or"
+        head += " episodes are only watched: nothing learns to act from them."
     else:
         head = "Nothing in this log says: its episodes are only watched."
     return [f"# What the robot was told to do. {head}", *lines, ""]

@@ -48,6 +48,7 @@ NEVER_WORDS = {
         "calibration",
         "timestamp",
         "timestamps",
+        "time",
         "clock",
         "index",
         "next",

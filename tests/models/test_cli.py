@@ -44,6 +44,7 @@ def test_the_preset_decides_the_recipe_of_any_dataset_and_the_split_its_episodes
 ) -> None:
     ended = CliRunner().invoke(app, ["train", "vqgan", "--data", str(split_store.root), "--preset", "cpu"])
     assert ended.exit_code == 0, ended.output
+    assert "the run: " in ended.output
     (call,) = trained
     assert (call["recipe"].width, call["recipe"].steps) == (16, 4000)
     assert call["run"] == split_store.root / "runs" / "vqgan-cpu"

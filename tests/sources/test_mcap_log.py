@@ -311,6 +311,35 @@ def test_two_channels_on_one_topic_are_told_together(tmp_path: Path) -> None:
     assert complete
 
 
+@pytest.mark.parametrize("lacking", [(), (0,), (1,), (0, 1)])
+def test_times_are_not_sold_as_all_where_a_chunks_index_lacks_a_channel(
+    tmp_path: Path, lacking: tuple[int, ...]
+) -> None:
+    """And nobody is handed the channel's other messages as if they were all."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=10_000)
+        writer.start("", "test")
+        channels = [writer.register_channel(topic, "json", 0) for topic in ("/a", "/b")]
+        for time in range(20):
+            writer.add_message(channels[time % 2], time, b"{}", time)
+            if time == 9:
+                indexes = writer._Writer__chunk_builder.message_indices  # type: ignore[attr-defined]
+                for number in lacking:
+                    del indexes[channels[number]]
+                writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
+        writer.finish()
+    with open_log(path) as log:
+        _, complete = log.message_times()
+        assert complete == (not lacking)
+        for number, topic in enumerate(("/a", "/b")):
+            if number in lacking and len(lacking) == 1:
+                with pytest.raises(LogError, match="5 messages where the file's own index counts 10"):
+                    list(log.messages([topic]))
+            else:
+                assert [message.log_time_ns for message in log.messages([topic])] == list(range(number, 20, 2))
+
+
 def test_after_a_message_that_does_not_fit_its_schema_the_next_one_can_be_had(tmp_path: Path) -> None:
     path = write_json(tmp_path / "run.mcap", [1, 3], before=lambda w: bad_message(w, 2))
     with open_log(path) as log:

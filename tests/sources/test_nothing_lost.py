@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rosbags.rosbag1 import Writer as Rosbag1Writer
 
 from tests.synthetic import write_mcap
-from tests.synthetic_bags import raw_messages, with_files, write_rosbag1, write_rosbag2
+from tests.synthetic_bags import ROS1_STORE, raw_messages, with_files, write_rosbag1, write_rosbag2
 from vilp_data.errors import LogError
 from vilp_data.sources import open_log
 
@@ -94,15 +95,54 @@ def test_a_chunk_that_the_index_lists_twice_is_an_error(bag: Path, tmp_path: Pat
     assert handed_out(tmp_path / "run.bag") is None
 
 
-def test_a_message_under_another_connections_number_is_an_error(bag: Path, tmp_path: Path) -> None:
-    """Though both connections are described, and the number of messages is right."""
-    content = bytearray(bag.read_bytes())
-    place = content.index(b"conn=", content.index(b"op=\x02") - 60)
-    while content[place : place + 5] != b"conn=" or b"op=\x02" not in content[place - 12 : place + 30]:
-        place = content.index(b"conn=", place + 1)
-    content[place + 5] ^= 1
-    (tmp_path / "run.bag").write_bytes(content)
-    assert handed_out(tmp_path / "run.bag") is None
+@pytest.fixture(scope="module")
+def alike(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag whose topics are of one type: a message fits any of them, so decoding tells nothing of where it belongs."""
+    path = tmp_path_factory.mktemp("alike") / "run.bag"
+    with Rosbag1Writer(path) as writer:
+        writer.chunk_threshold = 200
+        connections = [writer.add_connection(f"/t{n}", "std_msgs/msg/Int32", typestore=ROS1_STORE) for n in range(3)]
+        for n in range(9):
+            writer.write(connections[n % 3], 10**18 + n * 10**8, struct.pack("<i", n))
+    return path
+
+
+def test_a_bags_message_under_another_connection_or_time_is_an_error(alike: Path, tmp_path: Path) -> None:
+    """One bit of each byte of both, in chunks that nothing compresses and no checksum guards."""
+    content, path = alike.read_bytes(), tmp_path / "run.bag"
+    assert handed_out(alike) is not None
+    messages = list(_all(content, b"op=\x02"))
+    assert len(messages) == 9
+    for record in messages:
+        for field, size in ((b"conn=", 4), (b"time=", 8)):
+            begin = content.index(field, record) + len(field)
+            for place in range(begin, begin + size):
+                changed = bytearray(content)
+                changed[place] ^= 1 << place % 8
+                path.write_bytes(changed)
+                assert handed_out(path) is None, (record, field, place - begin)
+
+
+def test_a_bags_topic_or_type_by_another_name_is_an_error(alike: Path, tmp_path: Path) -> None:
+    """Whether in the bag's index or in a chunk: each tells of the other. A topic's name stands twice in each; the second is for nobody."""
+    content, path, expected = alike.read_bytes(), tmp_path / "run.bag", handed_out(alike)
+    caught = []
+    for name, other in ((b"topic=/t1", b"topic=/t2"), (b"type=std_msgs/Int32", b"type=std_msgs/UInt8")):
+        for place in _all(content, name):
+            path.write_bytes(content[:place] + other + content[place + len(name) :])
+            found = handed_out(path)
+            assert found in (None, expected), (name, place)
+            caught += [name] if found is None else []
+    assert caught.count(b"topic=/t1") == 2
+    assert caught.count(b"type=std_msgs/Int32") == 6
+
+
+def test_a_bag_behind_a_bag_is_not_passed_over(alike: Path, tmp_path: Path) -> None:
+    """As two parts put one after the other, which no bag is made of, though each is whole."""
+    path = tmp_path / "run.bag"
+    path.write_bytes(alike.read_bytes() * 2)
+    with pytest.raises(LogError, match=f"{alike.stat().st_size:,} bytes behind what the bag header counts"):
+        open_log(path)
 
 
 def test_a_bag_with_zeros_behind_it_is_whole(bag: Path, sent: Sent, tmp_path: Path) -> None:

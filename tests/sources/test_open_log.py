@@ -8,7 +8,7 @@ import pytest
 
 from tests.real_data import real_data
 from tests.synthetic import write_mcap, write_zarr
-from vilp_data.errors import LogError, UsageError
+from vilp_data.errors import LogError, UsageError, salvage_command
 from vilp_data.sources import open_log
 
 
@@ -73,5 +73,30 @@ def test_a_rosbag2_folder_stands_for_the_file_in_it(tmp_path: Path) -> None:
 
 
 def test_real_file_mangled_by_line_ending_conversion_is_recognised() -> None:
-    with pytest.raises(LogError, match="binary"):
-        open_log(real_data("logs/keelson/connectors_klog_bin_2024-05-15.mcap"))
+    path = real_data("logs/keelson/connectors_klog_bin_2024-05-15.mcap")
+    with pytest.raises(LogError, match="binary") as told:
+        open_log(path)
+    assert f"vilp-data salvage {path} -o " in str(told.value.remedy)
+
+
+def test_what_a_folder_that_nobody_may_write_to_holds_is_salvaged_into_the_one_at_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.access", lambda folder, mode: folder != tmp_path)
+    assert salvage_command(tmp_path / "run.bag").endswith("/run.bag -o run-salvaged.mcap`")
+    assert salvage_command(Path("run.bag")) == "`vilp-data salvage run.bag -o run-salvaged.mcap`"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "head"),
+    [("mcap", b"\x89MCAP0\r\r\n\r\n"), ("mcap", b"\x89MCAP0\n\1"), ("bag", b"#ROSBAG V2.0\r\n")],
+)
+def test_a_log_with_converted_line_endings_is_told_with_the_command_that_saves_it(
+    tmp_path: Path, suffix: str, head: bytes
+) -> None:
+    path = tmp_path / f"run.{suffix}"
+    path.write_bytes(head + bytes(200))
+    with pytest.raises(LogError, match="line endings") as told:
+        open_log(path)
+    assert f"*.{suffix}" in str(told.value.remedy)
+    assert f"`vilp-data salvage {path} -o {tmp_path / 'run-salvaged.mcap'}`" in str(told.value.remedy)

@@ -29,8 +29,8 @@ def action_findings(fit: ActionFit, *, topic: str, rate_hz: float, certain: bool
     elif fit.is_early:
         yield Finding(
             severity="note", kind="action-early", place=place, evidence=evidence,
-            what=f"the action fits best {_steps(-best)} early: that of step k{best} explains {max(fit.gain[best], 0):.0%} of the motion"
-            f" at step k, its own {max(fit.gain[0], 0):.0%}",
+            what=f"the motion at step k depends on actions up to that of step k{best}: together they explain"
+            f" {max(fit.up_to[best], 0):.0%} of it, and later ones, its own among them, add {fit.later_add(best):.1%}",
             remedy=f"a robot that follows its commands {-best * step_ms:.0f} ms later looks like this; if it does not, offset_s ="
             f" {-best / rate_hz:.4g} on the action's topic",
         )  # fmt: skip
@@ -46,7 +46,7 @@ def action_findings(fit: ActionFit, *, topic: str, rate_hz: float, certain: bool
             severity="warning", kind="action-odd-episode", place=Place(topic=topic, episode=name),
             what=f"here the action fits best {_steps(abs(shift))} {late}, unlike in the others",
             evidence={f"explained_at_shift_{shift:+d}": round(there, 4), "explained_at_shift_+0": round(here, 4)},
-            remedy="compare its clocks with another's by `vilp-data inspect`, or leave this episode out",
+            remedy="compare its clocks with another's by `vilp-data inspect`; once ingested, `vilp-data remove` leaves it out",
         )  # fmt: skip
 
 

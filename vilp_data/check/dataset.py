@@ -145,7 +145,11 @@ class _Look:
 
     def _labels(self, arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str) -> list[str]:
         parts = vector_parts(arrays[vector], self.spec.low_dim if vector == "low_dim" else self.spec.action)
-        return [f"{part}.{label}" if part else label for part, (labels, _) in parts.items() for label in labels]
+        return [
+            f"{part}.{label}" if part else f"{vector}[{label}]"
+            for part, (labels, _) in parts.items()
+            for label in labels
+        ]
 
     def _masked(self, entry: EpisodeEntry, valid: Bool, at_s: F64) -> Iterator[Finding]:
         share = 1 - float(valid.mean())

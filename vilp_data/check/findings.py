@@ -15,6 +15,9 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Worst first. An error: data that cannot be read, or that would train something wrong. A warning: data that ingest will mask, or that
 deserves a look. A note: nothing wrong, worth knowing."""
 
+UNREAD = ("unreadable", "damaged")
+"""Kinds that say only that something cannot be read."""
+
 Evidence = Mapping[str, float | int | str]
 
 
@@ -82,10 +85,12 @@ def worst_first(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def grouped(findings: Iterable[Finding]) -> list[Group]:
-    """Worst first; findings of one kind and severity become one group, at the place of its first."""
-    groups: dict[tuple[Severity, str], list[Finding]] = {}
+    """Worst first; findings of one kind and severity become one group, at the place of its first. What keeps a log from being read has
+    many causes, and each is a group."""
+    groups: dict[tuple[Severity, str, str], list[Finding]] = {}
     for finding in worst_first(findings):
-        groups.setdefault((finding.severity, finding.kind), []).append(finding)
+        cause = finding.what if finding.kind in UNREAD else ""
+        groups.setdefault((finding.severity, finding.kind, cause), []).append(finding)
     return [Group(tuple(members)) for members in groups.values()]
 
 

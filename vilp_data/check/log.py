@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from vilp_data.check.roles import Roles, guessed_roles, roles_of
 from vilp_data.check.timing import log_order_findings
 from vilp_data.check.tracks import PICTURES, Track
 from vilp_data.errors import LogError, VilpDataError, salvage_command
+from vilp_data.message_rate import rate_by_count
 from vilp_data.sources import IndexedLog, MessageError, open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import F32, I64, LogEpisode, Message
@@ -38,7 +40,8 @@ SALVAGED = (".mcap", ".bag", ".db3", ".active", ".zstd")
 
 
 def check_log(path: Path, *, spec: TaskSpec | None = None, progress: Callable[[float], None] | None = None) -> Checked:
-    """Everything that is wrong with a log. With a task, its actions and low_dim are known; else they are guessed by their names.
+    """Everything that is wrong with a log. With a task, its actions and low_dim are known, and nothing is said of topics that it does not
+    read; else they are guessed by their names.
 
     Never raises for what is in the log: a log that cannot be read is a finding. UsageError where there is none at `path`.
     `progress` gets the share of the log's time that was read."""
@@ -55,7 +58,8 @@ def check_log(path: Path, *, spec: TaskSpec | None = None, progress: Callable[[f
 def _unreadable(error: VilpDataError, source: str, *, kind: str = "unreadable", at: Place | None = None) -> Finding:
     evidence = {"found": str(error.found)} if error.found is not None else {}
     remedy = error.remedy
-    if DAMAGE.search(f"{error.what} {error.found}") and source.endswith(SALVAGED) and "mangled" not in error.what:
+    told = "vilp-data salvage" in (remedy or "")
+    if not told and DAMAGE.search(f"{error.what} {error.found}") and source.endswith(SALVAGED):
         remedy = f"{salvage_command(Path(source))} gets back what is there"
     return Finding(
         severity="error", kind=kind, place=at or Place(source=source), what=error.what, evidence=evidence, remedy=remedy
@@ -91,13 +95,19 @@ class _Reading:
             self._say("error", "empty", "the log holds no message", "leave it out, or record it again")
         span = (episodes[0].start_ns, max(episode.end_ns for episode in episodes)) if episodes else (0, 1)
         judge = LogJudge(self.source, self.tracks, roles, self.spec, span)
-        for number, episode in enumerate(episodes):
-            self._read(judge, episode, number, len(episodes))
+        whole: list[str] = getattr(self.log, "whole", None) or [episode.name for episode in episodes]
+        pictures = {name: _pictures(number, len(whole)) for number, name in enumerate(whole)}
+        for episode in episodes:
+            self._read(judge, episode, pictures.get(episode.name), several=len(episodes) > 1)
         judge.finish()
         self._say_notes()
+        found = [*self.findings, *judge.findings]
+        if self.spec is not None:
+            read = self.spec.topics()
+            found = [finding for finding in found if finding.place.topic in (None, *read)]
         return Checked(
             source=self.source, kind="log", format=self.log.format,
-            findings=tuple(worst_first([*self.findings, *judge.findings])), size_bytes=_size(self.path),
+            findings=tuple(worst_first(found)), size_bytes=_size(self.path),
             n_episodes=len(episodes), duration_s=(span[1] - span[0]) / 1e9 if episodes else 0.0,
             topics=tuple(self._facts(judge)), sheets=tuple(self._sheets(span[0], episodes)),
             thumbnails=self.thumbnails, steps=judge.steps,
@@ -142,9 +152,10 @@ class _Reading:
 
     # --- reading
 
-    def _read(self, judge: LogJudge, episode: LogEpisode, number: int, of: int) -> None:
-        """Read and judge one demonstration, as far as it can be read."""
-        name, step = episode.name if of > 1 else None, _picture_step(episode, number, of)
+    def _read(self, judge: LogJudge, episode: LogEpisode, pictures: int | None, *, several: bool) -> None:
+        """Read and judge one demonstration, as far as it can be read, keeping about so many pictures of each camera, None none."""
+        name = episode.name if several else None
+        step = None if pictures is None else max((episode.end_ns - episode.start_ns) // pictures, 1)
         for track in self.tracks.values():
             track.begin(episode.start_ns, step)
         judge.begin()
@@ -194,6 +205,9 @@ class _Reading:
         for info in self.log.topics():
             known, track = judge.topics.get(info.name), self.tracks.get(info.name)
             timing = known.timing if known else None
+            if timing is not None and not timing.periodic:
+                duration_s = (judge.span_ns[1] - judge.span_ns[0]) / 1e9
+                timing = replace(timing, rate_hz=rate_by_count(timing.n_messages, duration_s))
             yield TopicFacts(
                 info.name, info.schema, timing.n_messages if timing else info.message_count, timing,
                 track.image if track else None, self.notes.get(info.name), known.timeline if known and timing else None,
@@ -209,11 +223,9 @@ class _Reading:
                 )
 
 
-def _picture_step(episode: LogEpisode, number: int, of: int) -> int | None:
-    """Nanoseconds between pictures kept of a demonstration; None for one of which there is to be none."""
-    if number % -(-of // PICTURES):
-        return None
-    return max((episode.end_ns - episode.start_ns) // max(PICTURES // of, 1), 1)
+def _pictures(number: int, of: int) -> int | None:
+    """How many pictures to keep of the demonstration of that number; None for one of which there is to be none."""
+    return None if number % -(-of // PICTURES) else max(PICTURES // of, 1)
 
 
 def _label(time_ns: int, start_ns: int, starts: I64, episodes: list[LogEpisode]) -> str:

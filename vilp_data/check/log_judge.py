@@ -23,6 +23,7 @@ from vilp_data.check.timing import (
     timing_findings,
 )
 from vilp_data.check.tracks import TopicSamples, Track, runs_on_header
+from vilp_data.errors import number_of
 from vilp_data.sources import MessageError
 from vilp_data.spec import TaskSpec
 from vilp_data.types import LogEpisode
@@ -219,7 +220,7 @@ class LogJudge:
             evidence: Evidence = {"n_messages": known.malformed, "first": str(error.found)}
             yield Finding(
                 severity="error", kind="malformed", place=Place(source=self.source, topic=topic),
-                what=f"{known.malformed} messages do not fit their schema", evidence=evidence, remedy=error.remedy,
+                what=f"not fitting their schema: {number_of(known.malformed, 'message')}", evidence=evidence, remedy=error.remedy,
             )  # fmt: skip
 
     def _undecoded(self, topic: str, track: Track) -> Iterator[Finding]:

@@ -207,7 +207,7 @@ def _facts(topic: TopicFacts) -> Iterator[str]:
         yield f"<b>{topic.n_messages:,}</b> messages"
     timing = topic.timing
     if timing is not None and timing.rate_hz is not None:
-        yield f"<b>{timing.rate_hz:.4g}</b> Hz" if timing.periodic else "on events"
+        yield f"<b>{timing.rate_hz:.4g}</b> Hz" + ("" if timing.periodic else " on the whole, on events")
         if timing.jitter is not None and timing.periodic:
             yield f"jitter <b>{timing.jitter:.1%}</b>"
         if timing.max_gap_s is not None:

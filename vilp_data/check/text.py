@@ -8,6 +8,7 @@ from vilp_data.check.action_fit import ActionFit
 from vilp_data.check.findings import Evidence, Finding, Group, grouped, verdict
 from vilp_data.check.report import Checked, Fit
 from vilp_data.check.sources import CheckReport
+from vilp_data.errors import number_of
 
 SHOWN_PLACES = 3
 SHOWN_SOURCES = 12
@@ -19,7 +20,7 @@ def format_report(report: CheckReport) -> str:
     """The whole check; the verdict comes last, where a terminal stops scrolling."""
     findings = report.findings
     one = len(report.checked) == 1
-    lines = [f"{report.folder}: {len(report.checked)} logs"] if report.folder else []
+    lines = [f"{report.folder}: {number_of(len(report.checked), 'log')}"] if report.folder else []
     lines += [_source_line(checked).removeprefix(report.folder) for checked in report.checked[:SHOWN_SOURCES]]
     if len(report.checked) > SHOWN_SOURCES:
         lines.append(f"… and {len(report.checked) - SHOWN_SOURCES} more")
@@ -32,7 +33,7 @@ def format_report(report: CheckReport) -> str:
 
 
 def _source_line(checked: Checked) -> str:
-    counted = f"{checked.n_episodes} episode{'' if checked.n_episodes == 1 else 's'}, {duration(checked.duration_s)}"
+    counted = f"{number_of(checked.n_episodes, 'episode')}, {duration(checked.duration_s)}"
     return f"{checked.source}: {checked.format}, {checked.size_bytes / 1e6:.1f} MB" + (
         f", {counted}" if checked.n_episodes else ""
     )
@@ -89,8 +90,10 @@ def _fit_line(fit: Fit) -> str:
 
 def said_of(fit: ActionFit) -> str:
     """The verdict on a fit, in a few words."""
-    if fit.off:
-        return f"stored {_steps(abs(fit.off))} {'late' if fit.off > 0 else 'early'}"
+    if fit.is_early:
+        return f"actions later than {_steps(-fit.best)} before the motion add nothing to the earlier ones"
+    if fit.is_late:
+        return f"stored {_steps(fit.best)} late"
     if fit.is_untold:
         return "too smooth to tell one step from the next"
     return "it drives its own step, as it should" if fit.best == 0 else "not clear enough to call it off"

@@ -14,22 +14,14 @@ import numpy as np
 from vilp_data.align import BACKWARD_JUMP_NS, LONGEST_GAP_NS
 from vilp_data.check.findings import Finding, Place, Severity
 from vilp_data.decode import is_wall_clock
+from vilp_data.message_rate import GAP_FACTOR, MIN_MESSAGES, keeps_rate
 from vilp_data.types import F64, I64
-
-MIN_MESSAGES = 20
-"""Fewer messages show no rate that a gap or a jitter could be measured against."""
 
 FEW = 5
 """Fewer messages than this tell nothing of a clock."""
 
 STEADY = 0.5
 """A lag whose quartiles lie further apart than this share of it is no difference between two clocks."""
-
-PERIODIC_SPREAD = 0.5
-"""A topic has a rate where the middle half of its intervals lies within this share of the median; else it comes on events."""
-
-GAP_FACTOR = 5.0
-"""A gap is an interval of more than this many usual ones: fewer are missing messages, which are counted instead."""
 
 GAP_FLOOR_S = 0.1
 """Shorter silences are no gap at any rate: one step of a 10 Hz control clock bridges them."""
@@ -67,8 +59,9 @@ TOLD = 5
 class Timing:
     """Figures of one topic: over one segment of a log, or joined over several.
 
-    rate_hz, jitter  1 / median interval, and half the spread of intervals over the median; None where there is no rate
-    periodic         whether there is one: else it comes on events
+    rate_hz          1 / median interval, None where it keeps no rate; of a whole log, `message_rate.rate_by_count` then stands in
+    periodic         whether it keeps a rate: else it comes on events
+    jitter           half the spread of intervals over the median; None where that is 0
     max_gap_s        the longest interval; lag_s the median of log time minus header stamp
     header_clock     "none", "zero", "constant", "wall", "simulated"
     """
@@ -102,14 +95,12 @@ def measure(log_ns: I64, header_ns: I64 | None) -> Timing:
     lag_s = float(np.median(log_ns - header_ns)) / 1e9 if has_clock and header_ns is not None else None
     if len(intervals) == 0:
         return Timing(len(log_ns), None, False, None, None, clock, lag_s)
-    low, first, median, third, high = np.percentile(intervals, (5, 25, 50, 75, 95))
+    low, median, high = np.percentile(intervals, (5, 50, 95))
     longest = float(intervals.max())
     if median <= 0:
         return Timing(len(log_ns), None, False, None, longest, clock, lag_s)
-    periodic = len(log_ns) >= MIN_MESSAGES and third - first <= PERIODIC_SPREAD * median
-    return Timing(
-        len(log_ns), float(1 / median), bool(periodic), float((high - low) / (2 * median)), longest, clock, lag_s
-    )
+    periodic, jitter = keeps_rate(intervals), float((high - low) / (2 * median))
+    return Timing(len(log_ns), float(1 / median) if periodic else None, periodic, jitter, longest, clock, lag_s)
 
 
 def joined(one: Timing | None, other: Timing) -> Timing:
@@ -170,12 +161,13 @@ def _stamp_findings(
     if figures.periodic and figures.rate_hz is not None:
         yield from _gaps(topic, np.diff(stamps) / 1e9, at_s[order], 1 / figures.rate_hz, camera)
         yield from _jitter(topic, figures, camera)
-    elif camera and len(log_ns) >= MIN_MESSAGES and figures.rate_hz is not None:
-        evidence = {"usual_interval_s": 1 / figures.rate_hz, "longest_interval_s": figures.max_gap_s or 0.0}
+    elif camera and len(log_ns) >= MIN_MESSAGES and figures.jitter is not None:
+        mean_s = float(stamps[-1] - stamps[0]) / 1e9 / (len(stamps) - 1)
+        evidence = {"mean_interval_s": mean_s, "longest_interval_s": figures.max_gap_s or 0.0}
         yield Finding(
             severity="warning", kind="irregular-camera", place=Place(topic=topic), evidence=evidence,
-            what="the camera keeps no rate: half of its intervals lie far from the usual one",
-            remedy=f"state the task's rate_hz well below {figures.rate_hz:.3g}: a step then has an image of its own",
+            what="the camera keeps no rate: its intervals lie far from each other, or its images come in bursts",
+            remedy=f"state the task's rate_hz well below {1 / mean_s:.3g}: a step then has an image of its own",
         )  # fmt: skip
 
 

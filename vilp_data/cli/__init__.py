@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from vilp_data.cli import actions, check, datasets, export, history, logs, render, salvage, surgery, view
-from vilp_data.errors import VilpDataError
+from vilp_data.errors import UsageError, VilpDataError
 
 INTERRUPTED = 130
 
+NO_VERBS = {
+    "redo": "`vilp-data undo --operation N` brings again what undo N took; `vilp-data log` has the numbers",
+    "add": "`vilp-data ingest LOGS…` adds to the dataset in use",
+}
+"""Verbs that people look for, and what does it."""
+
+
+class _Verbs(TyperGroup):
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] in NO_VERBS:
+            raise UsageError(f"there is no verb {args[0]!r}", remedy=NO_VERBS[args[0]])
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=_Verbs,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -61,5 +78,8 @@ def run_app(commands: typer.Typer, name: str) -> None:
         sys.exit(error.exit_code)
     except SystemExit as end:
         if end.code == INTERRUPTED:
-            print(f"{name}: stopped; what was finished is kept, run the same command again to go on", file=sys.stderr)
+            print(
+                f"{name}: stopped; anything it had finished is kept, run the same command again to go on",
+                file=sys.stderr,
+            )
         raise

@@ -18,6 +18,7 @@ from vilp_data.cli.options import (
     print_json,
 )
 from vilp_data.engine import cpu_count
+from vilp_data.errors import number_of, some_of
 from vilp_data.spec import load_task
 
 
@@ -65,7 +66,7 @@ def split(
     crossing = [pair for pair in lock.near_duplicates if lock.assignment[pair.first] != lock.assignment[pair.second]]
     if crossing:
         closest = f"{crossing[0].first} and {crossing[0].second}"
-        print(f"  {len(crossing)} pairs across the sides look nearly alike, closest {closest}; see the lock")
+        print(f"  nearly alike, across the sides: {number_of(len(crossing), 'pair')}, closest {closest}; see the lock")
 
 
 def latents(
@@ -97,14 +98,14 @@ def latents(
         return
     for view, key in done.keys.items():
         print(
-            f"{root}/latents/{view}/{key}: {done.shards[view]} shards"
+            f"{root}/latents/{view}/{key}: {number_of(done.shards[view], 'shard')}"
             + ("" if done.written[view] else ", all there already")
         )
     if done.frames:
         bare = f"{done.ratio:.0%} of the bare forward loop ({done.bare_frames_per_s:.0f} frames/s)"
-        print(f"{done.frames} frames encoded at {done.frames_per_s:.0f} frames/s, {bare}")
+        print(f"{number_of(done.frames, 'frame')} encoded at {done.frames_per_s:.0f} frames/s, {bare}")
     if done.unseen:
-        print(f"  {len(done.unseen)} training episodes are new to the encoder: {', '.join(done.unseen[:5])}")
+        print(f"  training episodes that are new to the encoder: {some_of(done.unseen, 5)}")
 
 
 def why_stale(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vilp_data.cli.options import DatasetArgument, JsonOption, open_dataset, print_json, progress_bar
+from vilp_data.errors import number_of
 
 if TYPE_CHECKING:
     from vilp_data.export import ExportReport
@@ -101,7 +102,9 @@ def card(
     root, _ = open_dataset(dataset)
     path = out or root / "README.md"
     sheet = write_card(EpisodeStore(root), path, licence=licence, force=force)
-    print_json({"card": path, "contact_sheet": sheet}) if as_json else print(f"{path}\n{sheet}")
+    print_json({"card": path, "contact_sheet": sheet}) if as_json else print(
+        path, *([sheet] if sheet else []), sep="\n"
+    )
 
 
 def _print_report(report: ExportReport) -> None:
@@ -109,7 +112,7 @@ def _print_report(report: ExportReport) -> None:
     parts = ", ".join(f"{count} {sides[side]}" for side, count in report.sides.items())
     seconds = f"{report.bytes / 1e6:.1f} MB, written in {report.write_s:.1f} s, compared in {report.check_s:.1f} s"
     print(
-        f"{report.out}: {_many(report.episodes, 'episode')} ({parts}), {report.rows} rows at {report.rate_hz:g} Hz; {seconds}"
+        f"{report.out}: {number_of(report.episodes, 'episode')} ({parts}), {report.rows} rows at {report.rate_hz:g} Hz; {seconds}"
     )
     for view, one in report.views.items():
         near = (
@@ -121,10 +124,10 @@ def _print_report(report: ExportReport) -> None:
     for what in report.verified:
         print(f"  read back: {what}")
     for reason, ids in report.left_out.items():
-        print(f"  left out, {reason}: {_many(len(ids), 'episode')}, such as {', '.join(ids[:SHOWN_IDS])}")
+        print(f"  left out, {reason}: {number_of(len(ids), 'episode')}, such as {', '.join(ids[:SHOWN_IDS])}")
     if report.masked:
         done = {"cut": "cut there", "mark": "marked in `valid`, their numbers NaN"}[report.masked_as]
-        print(f"  masked steps: {sum(report.masked.values())} in {_many(len(report.masked), 'episode')}; {done}")
+        print(f"  masked steps: {sum(report.masked.values())} in {number_of(len(report.masked), 'episode')}; {done}")
     if report.cut_away:
         print(f"  lost between cuts: {sum(report.cut_away.values())} valid steps that stood alone")
     for what, why in report.not_carried.items():
@@ -132,7 +135,3 @@ def _print_report(report: ExportReport) -> None:
     for note in report.notes:
         print(f"  {note}")
     print("  where everything lies: README.md and export.json in the folder")
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}" + ("" if count == 1 else "s")

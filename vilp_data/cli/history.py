@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -11,16 +12,28 @@ from typing import Annotated, Any
 
 import typer
 
-from vilp_data.cli.options import DatasetArgument, JsonOption, open_dataset, print_json
+from vilp_data.cli.options import DatasetArgument, JsonOption, console, print_json
 from vilp_data.dataset_state import DatasetState, read_state
-from vilp_data.errors import UsageError
+from vilp_data.episodes import EpisodeStore
+from vilp_data.errors import UsageError, number_of
 from vilp_data.history import HistoryEntry
-from vilp_data.locate import find_dataset, is_dataset
+from vilp_data.locate import find_dataset, has_been_dataset, is_dataset, remember
 from vilp_data.surgery.garbage import KEEP
 from vilp_data.surgery.state_diff import StateDiff, compare_states
 
 SHOWN = 12
 """Episodes listed one by one before the rest are counted."""
+
+
+def _open(given: Path | None) -> Path:
+    """The dataset whose history is meant: one that an undo emptied, too. StoreError where it is another version's."""
+    root = find_dataset(given, emptied=True)
+    if given is None:
+        console.print(f"dataset: {root}", highlight=False)
+    remember(root)
+    if is_dataset(root):
+        EpisodeStore(root).spec()
+    return root
 
 
 def log(dataset: DatasetArgument = None, as_json: JsonOption = False) -> None:
@@ -30,7 +43,7 @@ def log(dataset: DatasetArgument = None, as_json: JsonOption = False) -> None:
     """
     from vilp_data.history import read_history
 
-    root, _ = open_dataset(dataset)
+    root = _open(dataset)
     damaged: list[str] = []
     entries = read_history(root, damaged)
     if as_json:
@@ -56,7 +69,7 @@ def _print_log(root: Path, entries: list[HistoryEntry]) -> None:
             f"{entry.number:4d}  {entry.when}  {entry.what}: {entry.note}"
             + (" (interrupted)" if entry.interrupted else "")
         )
-        many = "1 episode" if entry.n_episodes == 1 else f"{entry.n_episodes} episodes"
+        many = number_of(entry.n_episodes, "episode")
         print(f"      {entry.before[:12]} -> {entry.after[:12]}, {many}, {entry.n_steps} steps")
         if entry.command:
             print(f"      $ {entry.command}")
@@ -108,13 +121,13 @@ def undo(
     """
     from vilp_data.surgery.undo import undo as take_back
 
-    root, _ = open_dataset(dataset)
+    root = _open(dataset)
     entry = take_back(root, operation)
     if as_json:
         print_json(_without_files(entry))
     else:
-        print(f"{root}: {entry.note}; {entry.n_episodes} episodes, {entry.n_steps} steps")
-        print(f"  `vilp-data undo {root} --operation {entry.number}` takes that back in turn")
+        print(f"{root}: {entry.note}; {number_of(entry.n_episodes, 'episode')}, {entry.n_steps} steps")
+        print(f"  `vilp-data undo {shlex.quote(str(root))} --operation {entry.number}` takes that back in turn")
 
 
 def gc(
@@ -137,7 +150,7 @@ def gc(
     """
     from vilp_data.surgery.garbage import collect_garbage, size_text
 
-    root, _ = open_dataset(dataset)
+    root = _open(dataset)
     report = collect_garbage(root, keep=keep, runs=run or (), dry_run=dry_run)
     if as_json:
         print_json(dataclasses.asdict(report))
@@ -146,12 +159,12 @@ def gc(
     for one in report.found:
         size[one.why] += one.size
     for why in sorted(count):
-        print(f"  {count[why]} files, {size_text(size[why])}: {why}")
+        print(f"  {number_of(count[why], 'file')}, {size_text(size[why])}: {why}")
     for note in report.notes:
         print(f"  {note}")
     done = "would be deleted" if dry_run else "deleted"
     print(
-        f"{root}: {len(report.found)} files, {size_text(report.size)}, {done}"
+        f"{root}: {number_of(len(report.found), 'file')}, {size_text(report.size)}, {done}"
         if report.found
         else f"{root}: nothing to delete"
     )
@@ -162,16 +175,16 @@ def _state(given: str | None, data: Path | None, default: str) -> DatasetState:
     from vilp_data.history import numbers, state_after
     from vilp_data.writer_lock import await_settled
 
-    if given is not None and given.isdigit() and is_dataset(Path(given)):
+    if given is not None and given.isdigit() and has_been_dataset(Path(given)):
         remedy = f"./{given} for the dataset, 0{given} for the operation"
         raise UsageError("both a dataset here and the number of an operation", where=given, remedy=remedy)
     if given is not None and not given.isdigit():
-        if not is_dataset(Path(given)):
+        if not has_been_dataset(Path(given)):
             remedy = "a dataset folder, or the number of an operation as `vilp-data log` lists them"
             raise UsageError("neither a dataset nor an operation", where=given, remedy=remedy)
         await_settled(Path(given))
         return read_state(Path(given))
-    root = find_dataset(data)
+    root = find_dataset(data, emptied=True)
     await_settled(root)
     if given is not None:
         return state_after(root, int(given))

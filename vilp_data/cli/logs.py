@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,11 +24,14 @@ from vilp_data.cli.options import (
 )
 from vilp_data.engine import cpu_count
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import UsageError, some_of
-from vilp_data.locate import default_root, find_dataset, remember
+from vilp_data.errors import UsageError, number_of, some_of
+from vilp_data.locate import a_dataset, default_root, find_dataset, has_been_dataset, is_dataset, remember
 from vilp_data.log_files import find_logs, is_one_log
 from vilp_data.sources.rosbag2_metadata import is_bag_folder
 from vilp_data.spec import TaskSpec, load_task
+
+if TYPE_CHECKING:
+    from vilp_data.ingest import IngestReport
 
 FULL_FAILURES = 3  # of the same kind, said in full
 
@@ -80,7 +85,7 @@ def record(
         print_json([dataclasses.asdict(episode) for episode in recorded])
     else:
         print(
-            f"{folder}: {len(recorded)} logs, {succeeded} successful"
+            f"{folder}: {number_of(len(recorded), 'log')}, {succeeded} successful"
             + ("" if succeeded == len(recorded) else "; failures are tagged, and ingest leaves them out")
         )
 
@@ -127,6 +132,8 @@ def _one_log(path: Path) -> Path:
     """The log at a path, or the only one in a plain folder. UsageError where a folder holds others, with their names."""
     if not path.is_dir() or is_one_log(path) or is_bag_folder(path):
         return path
+    if is_dataset(path):
+        raise a_dataset(path)
     found = find_logs([path])
     if len(found.logs) == 1 and not found.passed_over:
         return found.logs[0]
@@ -203,45 +210,56 @@ def ingest(
         if not print_cuts(logs, spec, as_json=as_json):
             raise typer.Exit(1)
         return
+    revives = has_been_dataset(root) and not is_dataset(root)
     with progress_bar(f"ingesting into {root}", None) as advance:
         report = ingest_logs(
             logs, root, spec, workers=workers or cpu_count(), include_failures=include_failures,
             with_rollouts=with_rollouts, again=again, progress=advance,
         )  # fmt: skip
-    tagged = tag_episodes(root, spec, [*report.written, *report.fresh], pairs)
+    tagged = tag_episodes(root, [*report.written, *report.fresh], pairs)
     remember(root)
     if as_json:
         print_json(dataclasses.asdict(report) | {"tagged": tagged})
     else:
-        print(
-            f"{root}: {len(report.written)} episodes ingested, {len(report.fresh)} already there"
-            + (f", {len(report.left_out)} failures left out" if report.left_out else "")
-            + (f", {len(report.failed)} could not be read" if report.failed else "")
-        )
-        if tagged:
-            print(f"  {len(tagged)} got tags that their logs do not have, from the task's [tags] or --set")
-        if report.rollouts:
-            many = "1 rollout" if len(report.rollouts) == 1 else f"{len(report.rollouts)} rollouts"
-            print(f"  {many} of a policy left out; --with-rollouts stores what no model will learn from")
-        if report.removed:
-            stay = "1 episode was" if len(report.removed) == 1 else f"{len(report.removed)} episodes were"
-            listed = ", ".join(report.removed[:5]) + (", …" if len(report.removed) > 5 else "")
-            print(f"  {stay} removed on purpose before, and left out: {listed}; --again takes them")
-        if report.replaced:
-            print(f"  replaced, since their log changed: {', '.join(report.replaced)}")
-        if report.restated:
-            print(f"  told otherwise by the task now, their labels brought up to date: {', '.join(report.restated)}")
-        if report.passed_over:
-            print(f"  passed over, recordings left open and links that lead nowhere: {', '.join(report.passed_over)}")
-        for note in report.notes:
-            print(f"  {note}")
-        for episode, findings in sorted(report.findings.items()):
-            for finding in findings:
-                print(f"  {episode}: {finding}")
+        _say_ingested(root, report, revives=revives, tagged=tagged)
         for line in _failures(report.failed):
             print(line, file=sys.stderr)
     if report.failed:
         raise typer.Exit(1)
+
+
+def _say_ingested(root: Path, report: IngestReport, *, revives: bool, tagged: Sequence[str]) -> None:
+    """What became of the demonstrations. `tagged` got labels of --set. `revives`: an undo had left the folder with no more
+    than its history."""
+    print(
+        f"{root}: {number_of(len(report.written), 'episode')} ingested, {len(report.fresh)} already there"
+        + (f", {number_of(len(report.left_out), 'failure')} left out" if report.left_out else "")
+        + (f", {len(report.failed)} could not be read" if report.failed else "")
+    )
+    if tagged:
+        print(f"  {len(tagged)} got the labels of --set")
+    if report.rollouts:
+        many = number_of(len(report.rollouts), "rollout")
+        print(f"  {many} of a policy left out; --with-rollouts stores what no model will learn from")
+    if report.removed:
+        stay = "1 episode was" if len(report.removed) == 1 else f"{len(report.removed)} episodes were"
+        listed = ", ".join(report.removed[:5]) + (", …" if len(report.removed) > 5 else "")
+        print(f"  {stay} removed on purpose before, and left out: {listed}; --again takes them")
+    if report.replaced:
+        print(f"  replaced, since their log or their range changed: {', '.join(report.replaced)}")
+    if report.restated:
+        print(
+            f"  told otherwise by their log or the task now, their labels brought up to date: {', '.join(report.restated)}"
+        )
+    if report.passed_over:
+        print(f"  passed over, recordings left open and links that lead nowhere: {', '.join(report.passed_over)}")
+    if revives:
+        print(f"  an earlier ingest here was taken back; its history goes on: `vilp-data log {shlex.quote(str(root))}`")
+    for note in report.notes:
+        print(f"  {note}")
+    for episode, findings in sorted(report.findings.items()):
+        for finding in findings:
+            print(f"  {episode}: {finding}")
 
 
 def _failures(failed: list[tuple[str, str]]) -> list[str]:
@@ -252,10 +270,15 @@ def _failures(failed: list[tuple[str, str]]) -> list[str]:
         alike.setdefault(message.partition("\n")[0].rpartition(": ")[2], []).append((name, message))
     lines = []
     for what, group in alike.items():
-        lines += [f"  {name}: {message}" for name, message in group[:FULL_FAILURES]]
+        lines += [f"  {_named(name, message)}" for name, message in group[:FULL_FAILURES]]
         if rest := [name for name, _ in group[FULL_FAILURES:]]:
             lines.append(f"  {len(rest)} more, {what}: {some_of(rest, FULL_FAILURES)} (--json has all)")
     return lines
+
+
+def _named(name: str, message: str) -> str:
+    """The message, under the name of what it is about unless it begins with that."""
+    return message if Path(message.partition(": ")[0]).name == name else f"{name}: {message}"
 
 
 def _dataset_and_its_spec(given: Path | None) -> tuple[Path, TaskSpec]:

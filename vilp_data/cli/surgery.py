@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from vilp_data.cli.options import JsonOption, label_pairs, open_dataset, print_json
-from vilp_data.errors import UsageError
+from vilp_data.errors import UsageError, number_of, some_of
 
 EpisodesArgument = Annotated[list[str], typer.Argument(help="Ids of episodes.", show_default=False)]
 DataOption = Annotated[
@@ -34,7 +34,11 @@ def remove(
     if as_json:
         print_json(dataclasses.asdict(report))
         return
-    _say(root, report.operation, f"{len(report.changed)} episodes removed" if report.changed else "nothing to remove")
+    _say(
+        root,
+        report.operation,
+        f"{number_of(len(report.changed), 'episode')} removed" if report.changed else "nothing to remove",
+    )
     _list(report.notes)
 
 
@@ -81,6 +85,8 @@ def trim(
         kept = f"{cut.counted_from + cut.first} to {cut.counted_from + cut.end - 1}"
         print(f"  {cut.id}: keeps steps {kept}, {cut.end - cut.first} of {cut.n_steps}; {seconds} go")
     for cut in cuts:
+        if cut.past_end:
+            print(f"  {cut.id}: the range goes on past its last step; it keeps what there is")
         if not cut.moves:
             print(f"  {cut.id}: nothing in it moves; left as it is (`vilp-data remove` takes it out)")
     gone = sum(cut.n_steps - cut.end + cut.first for cut in cutting)
@@ -88,7 +94,7 @@ def trim(
     _say(
         root,
         operation,
-        f"{gone} of {n_steps} steps, of {len(cutting)} episodes, {done}" if cutting else "nothing to trim",
+        f"{gone} of {n_steps} steps, of {number_of(len(cutting), 'episode')}, {done}" if cutting else "nothing to trim",
     )
 
 
@@ -124,7 +130,7 @@ def relabel(
     _say(
         root,
         report.operation,
-        f"{len(report.changed)} episodes relabelled" if report.changed else "they say so already",
+        f"{number_of(len(report.changed), 'episode')} relabelled" if report.changed else "they say so already",
     )
     _list(report.notes)
 
@@ -150,17 +156,17 @@ def merge(
     if as_json:
         print_json(dataclasses.asdict(report))
         return
-    latents = f", with {report.latents} latent files" if report.latents else ""
-    _say(root, report.operation, f"{len(report.added)} episodes taken from {other}{latents}")
+    latents = f", with {number_of(report.latents, 'latent file')}" if report.latents else ""
+    _say(root, report.operation, f"{number_of(len(report.added), 'episode')} taken from {other}{latents}")
     if report.here:
-        print(f"  {len(report.here)} are here already, by their log or their content")
+        print(f"  here already, by log or content: {number_of(len(report.here), 'episode')}")
     if report.removed:
-        print(f"  {len(report.removed)} were removed here before, and stay out: {', '.join(report.removed[:5])}")
+        print(f"  removed here before, and left out: {some_of(report.removed, 5)}")
     for there, here in sorted(report.renamed.items()):
         print(f"  {there} is called {here} here, where another has that name")
     _list(report.notes)
     if report.added and (root / "split.lock.json").is_file():
-        print(f"  they have no side of the split yet: `vilp-data split {root}` gives them one and moves no other")
+        print(f"  what is new has no side of the split yet: `vilp-data split {root}` gives it one and moves no other")
 
 
 def _pairs(labels: list[str], outcome: str | None) -> dict[str, str]:

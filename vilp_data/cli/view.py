@@ -30,7 +30,9 @@ def view(
     ] = None,
     episode: Annotated[
         str | None,
-        typer.Option(help="Which demonstration of a log that holds many. Default: the first.", show_default=False),
+        typer.Option(
+            help="Which demonstration of a log that holds many. Default: the first whole one.", show_default=False
+        ),
     ] = None,
     run: Annotated[
         Path | None,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import UsageError, nearest
+from vilp_data.errors import UsageError, nearest, number_of
 from vilp_data.export import diffusion_policy, lerobot, lerobot_check, robomimic
 from vilp_data.export.folder import MANIFEST, out_folder, require_free
 from vilp_data.export.job import ExportJob, Images, ViewWritten, Written
@@ -212,7 +212,8 @@ def _notes(job: ExportJob) -> list[str]:
     if job.chosen.unlabelled:
         notes.append(f"episodes without actions, theirs are NaN: {len(job.chosen.unlabelled)}")
     if job.shapes.action is None:
-        notes.append("no episode has actions: video and low_dim alone")
+        alone = " and ".join(["video"] * bool(job.shapes.views) + ["low_dim"] * bool(job.shapes.low_dim))
+        notes.append(f"no episode has actions: {alone} alone")
     for name, columns, parts in (("low_dim", job.low_dim, job.spec.low_dim), ("action", job.action, job.spec.action)):
         if len(columns) == 1 and len(parts) > 1:
             notes.append(f"{name} in one piece: the task does not say how wide each of {', '.join(parts)} is")
@@ -227,7 +228,9 @@ def _write_card(job: ExportJob, folder: Path, to: str, report: ExportReport, lic
 
 
 def _card_lines(to: str, report: ExportReport) -> list[str]:
-    lines = [f"Exported to {to}: {report.episodes} episodes, {report.rows} rows at {report.rate_hz:g} Hz."]
+    lines = [
+        f"Exported to {to}: {number_of(report.episodes, 'episode')}, {number_of(report.rows, 'row')} at {report.rate_hz:g} Hz."
+    ]
     for view, one in report.views.items():
         error = (
             "every pixel equal"
@@ -240,7 +243,7 @@ def _card_lines(to: str, report: ExportReport) -> list[str]:
     lines += [f"Left out, {reason}: {len(ids)}." for reason, ids in report.left_out.items()]
     if report.masked:
         lines.append(
-            f"Masked steps: {sum(report.masked.values())} in {len(report.masked)} episodes, {_masked_words(report)}."
+            f"Masked steps: {sum(report.masked.values())} in {number_of(len(report.masked), 'episode')}, {_masked_words(report)}."
         )
     return lines + [f"{note}." for note in report.notes]
 

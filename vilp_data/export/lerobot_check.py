@@ -36,11 +36,9 @@ def check(job: ExportJob, folder: Path, written: Written) -> list[str]:
     reader.require_end()
     for view, error in errors.items():
         written.views[view].psnr_db, written.views[view].psnr_min_db = error.psnr_db()
-    frames = f"{len(errors) * job.chosen.n_rows} frames"
-    return [
-        f"{job.chosen.n_rows} rows of the table equal to the stored steps",
-        f"{frames} decoded in order, row k against frame k",
-    ]
+    n_frames = len(errors) * job.chosen.n_rows
+    frames = [f"{n_frames} frames decoded in order, row k against frame k"] if n_frames else []
+    return [f"{job.chosen.n_rows} rows of the table equal to the stored steps", *frames]
 
 
 class _Reader:

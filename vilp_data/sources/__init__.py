@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from vilp_data.errors import LogError, UsageError
+from vilp_data.errors import LogError, UsageError, mangled
 from vilp_data.sources.db3_log import MAGIC as SQLITE_MAGIC
 from vilp_data.sources.db3_log import Db3Log
 from vilp_data.sources.file_bytes import first_bytes
@@ -111,11 +111,7 @@ def _not_a_log(path: Path, head: bytes) -> LogError:
             remedy="copy it again from its source",
         )
     if head.startswith(MCAP_MAGIC[:5]):
-        found = f"it begins with {head[:8]!r} instead of {MCAP_MAGIC!r}"
-        remedy = "copy it again in binary mode (git: mark *.mcap as binary in .gitattributes)"
-        return LogError(
-            "an MCAP file mangled in transfer, its line endings converted", where=path, found=found, remedy=remedy
-        )
+        return mangled("an MCAP file", path, head[:9])
     return LogError("not a log", where=path, found=f"it begins with {head!r}", remedy=_readable())
 
 

@@ -68,6 +68,9 @@ class Channels:
         """Channel -> its topic."""
         return {channel_id: channel.topic for channel_id, channel in self._channels.items()}
 
+    def topic_of(self, raw: RawMessage) -> str:
+        return self._channels[raw.channel_id].topic
+
     def topics(self, counts: Mapping[int, int] | None) -> list[TopicInfo]:
         """Every topic, sorted by name; `counts` by channel, None where nothing tells them."""
         by_topic: dict[str, TopicInfo] = {}

@@ -108,6 +108,15 @@ class Db3Log:
             (*ids, first, end),
         )
 
+    def topic_of(self, raw: RawMessage) -> str:
+        return self._channels.topic_of(raw)
+
+    def by_topic(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, RawMessage]]:
+        """The messages that `raw_messages` gives, each with its topic."""
+        return ((self.topic_of(raw), raw) for raw in self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
+
     def decoded(self, raw: RawMessage) -> Message:
         """The message of some bytes; MessageError where they do not fit its schema."""
         return self._channels.decoded(raw)

@@ -27,7 +27,7 @@ from vilp_data.types import F64, I64, LogEpisode, Message, TopicInfo
 SCHEMAS = {"video": "array", "numbers": "array", "image": "foxglove.CompressedImage", "text": "text"}
 LISTED_ROWS = 100_000  # whose times `message_times` looks up
 LOOKED_AT = 50  # episodes in which `first_messages` looks for a topic
-REWRITE = "leave this episode out, or write the dataset again: timestamp = frame_index / fps"
+REWRITE = "write the dataset again: timestamp = frame_index / fps; `vilp-data ingest` takes the other episodes without this one"
 SHOWN_INFO = ("codebase_version", "robot_type", "fps")  # not its totals: the list of episodes tells what is there
 
 
@@ -96,9 +96,12 @@ class LeRobotLog:
         return {"info": info} | ({"names": names} if names else {})
 
     @property
-    def n_whole(self) -> int:
-        """How many of the episodes have all their files."""
-        return sum(all(self._has(episode, name) for name in self._meta.features) for episode in self._meta.episodes)
+    def whole(self) -> list[str]:
+        """The names of the episodes that have all their files."""
+        features = self._meta.features
+        return [
+            name for name, (episode, _) in self._episodes.items() if all(self._has(episode, key) for key in features)
+        ]
 
     def episodes(self) -> list[LogEpisode]:
         return [
@@ -205,8 +208,9 @@ class LeRobotLog:
             }
             rows = table.rows([feature for feature in features if feature.kind != "video"], first, stop)
             for time_ns, row in zip(times_ns[first:stop].tolist(), rows, strict=True):
-                for feature in features:
-                    body = next(videos[feature.name]) if feature.kind == "video" else row[feature.name]
+                # All of a row before any of it: a video that is missing leaves no topic a message ahead of the others.
+                bodies = [next(videos[one.name]) if one.kind == "video" else row[one.name] for one in features]
+                for feature, body in zip(features, bodies, strict=True):
                     yield Message(feature.name, SCHEMAS[feature.kind], time_ns, time_ns, body)
 
     def _frames(self, episode: EpisodeMeta, key: str, shown_s: F64) -> Iterator[Any]:

@@ -34,7 +34,7 @@ class EpisodeTable:
         self._where = f"{self.path}, episode {episode.index}"
         self.n_rows = episode.n_rows
         if not self.path.is_file():
-            remedy = "download it, or leave this episode out"
+            remedy = "download it; `vilp-data ingest` takes the other episodes without it"
             raise LogError("the episode's table is missing", where=f"{root}, episode {episode.index}",
                            found=f"no file {episode.table}", remedy=remedy)  # fmt: skip
         try:

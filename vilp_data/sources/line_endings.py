@@ -16,6 +16,7 @@ from typing import BinaryIO
 import zstandard
 from mcap.opcode import Opcode
 
+from vilp_data.errors import number_of
 from vilp_data.sources.file_bytes import FileBytes
 from vilp_data.sources.inflate import UNFINISHED, inflate, inflate_prefix
 from vilp_data.sources.mcap_records import CHUNK_HEAD, MAGIC, RECORD_HEAD
@@ -90,7 +91,7 @@ def _with_returns(source: FileBytes, out: BinaryIO) -> str:
             for begin in range(position, position + length, BLOCK):
                 out.write(source.at(begin, min(BLOCK, position + length - begin)))
         position += length
-    return f"its pairs \\r\\n had become line feeds: {found} chunks made whole again, as their checksums say"
+    return f"its pairs \\r\\n had become line feeds: {number_of(found, 'chunk')} made whole again, as checksums say"
 
 
 def _record_length(source: FileBytes, position: int) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
-from vilp_data.errors import LogError, copy_or_salvage
+from vilp_data.errors import LogError, copy_or_salvage, number_of
 from vilp_data.sources.mcap_loose import FileRecord, LooseRun, LooseRuns, file_records
 from vilp_data.sources.mcap_records import CHUNK_HEAD, LAST_NS, MAGIC, MESSAGE_HEAD, RECORD_HEAD, RecordReader
 
@@ -282,8 +282,9 @@ def _cut_off(reader: RecordReader) -> LogError:
             start, end = struct.unpack("<QQ", reader.bytes_at(position + RECORD_HEAD.size, 16, "a chunk"))
             chunks, first_ns, last_ns = chunks + 1, min(first_ns, start), max(last_ns, end)
         position += RECORD_HEAD.size + length
-    intact = f"the first {min(position, reader.size):,} of {reader.size:,} bytes are whole"
-    held = f"{chunks} chunks, {(last_ns - first_ns) / 1e9:.1f} s of messages" if chunks else "no chunk among them"
+    intact = f"whole records up to byte {min(position, reader.size):,} of {reader.size:,}"
+    held = f"{number_of(chunks, 'chunk')}, {(last_ns - first_ns) / 1e9:.1f} s of messages"
+    held = held if chunks else "no whole chunk; of one that is cut a part can be had"
     return LogError(
         "the log is cut off: the recorder was stopped, or a copy did not finish",
         where=reader.path,

@@ -1,11 +1,16 @@
 """ROS message definitions that no robot writes, refused before code is made of them.
 
+rosbags turns a definition into Python and runs it, names as they stand, and a log's schema record may hold any text as a name. Its
+parsers refuse most that is no name, but not all (`3d_msgs/msg/Scan` ends as a SyntaxError), so that does not hang on them alone.
+
 A definition of one line can ask for a billion fields (`string[1000000000] a`), or for a list of messages without members: in ROS 1
 those take no bytes, and a message of four bytes may claim four billion of them. In CDR they take one each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import keyword
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -17,12 +22,19 @@ MOST_FIELDS = 5000
 
 EMPTY_MEMBER = "structure_needs_at_least_one_member"  # what IDL puts into a type without members
 
+_MEMBER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_TYPE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
+
 # Type name -> (constants, [(field name, its description)]), as rosbags parses definitions.
 Types = Mapping[str, Any]
 
 
 def refuse_unreasonable(types: Types, *, empty_takes_bytes: bool) -> None:
-    """ValueError where a type has too many fields, contains itself, nests too deep, or repeats what takes no bytes."""
+    """ValueError where a name is more than a name, where a type has too many fields, contains itself, nests too deep, or repeats what
+    takes no bytes."""
+    for name, (constants, fields) in types.items():
+        _require_names(_TYPE, [name, *(inner for _, kind in fields if (inner := _inner_name(kind)) is not None)])
+        _require_names(_MEMBER, [member[0] for member in (*constants, *fields)])
     depths: dict[str, int] = {}
     for name, (_, fields) in types.items():
         if (count := sum(_count(kind) for _, kind in fields)) > MOST_FIELDS:
@@ -32,6 +44,13 @@ def refuse_unreasonable(types: Types, *, empty_takes_bytes: bool) -> None:
         for field, kind in fields:
             if kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _is_empty(kind[1][0], types):
                 raise ValueError(f"{name}.{field} repeats a message without members")
+
+
+def _require_names(pattern: re.Pattern[str], names: Sequence[str]) -> None:
+    """ValueError for a name that is not of ASCII letters, digits and _, with slashes in a type's; or that Python keeps for itself."""
+    for name in names:
+        if not pattern.fullmatch(name) or (pattern is _TYPE and keyword.iskeyword(name)):
+            raise ValueError(f"{name[:60]!r} is no name")
 
 
 def _count(kind: Any) -> int:

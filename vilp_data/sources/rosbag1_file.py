@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from vilp_data import limits
-from vilp_data.errors import LogError, copy_or_salvage, salvage_command
+from vilp_data.errors import LogError, copy_or_salvage, mangled, salvage_command
 from vilp_data.sources.channels import RawMessage
 from vilp_data.sources.chunked_log import MessageChunk
 from vilp_data.sources.file_bytes import FileBytes
 from vilp_data.sources.inflate import inflate
+from vilp_data.sources.line_endings import is_converted
 from vilp_data.sources.rosbag1_records import (
     BAG_HEADER,
     CHUNK,
@@ -167,6 +168,8 @@ class Rosbag1File:
     def _another_head(self, head: bytes) -> LogError:
         if MAGIC.startswith(head):
             return self._cut_off(f"{len(head)} bytes")
+        if is_converted(begin := self._bytes.at(0, len(MAGIC) + 1)):
+            return mangled("a bag", self.path, begin)
         remedy = "`rosbag migrate`, where ROS 1 is installed, makes a 2.0 bag of it"
         return LogError(
             "a bag of a version that is not read", where=self.path, found=f"it begins with {head!r}", remedy=remedy

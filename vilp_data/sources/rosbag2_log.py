@@ -108,6 +108,15 @@ class Rosbag2Log:
         """The messages that `messages` gives, still serialised; channels are numbered in each file by itself."""
         return (message.raw for message in self._serialised(set(topics), start_ns, end_ns))
 
+    def by_topic(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, RawMessage]]:
+        """The messages that `raw_messages` gives, each with its topic."""
+        return (
+            (message.log.topic_of(message.raw), message.raw)
+            for message in self._serialised(set(topics), start_ns, end_ns)
+        )
+
     def message_times(self) -> tuple[dict[str, I64], bool]:
         """Topic -> log times [n], file after file; and whether they are all (else the first part)."""
         parts: dict[str, list[I64]] = {}

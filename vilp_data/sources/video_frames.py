@@ -124,7 +124,7 @@ def video_sha256(path: Path, start_ns: int, end_ns: int, *, where: str) -> str:
 
 def _opened(path: Path, where: str) -> Any:
     if not path.is_file():
-        remedy = "download it, or leave this episode out"
+        remedy = "download it; `vilp-data ingest` takes the other episodes without it"
         raise LogError("the video is missing", where=where, found=f"no file {path}", remedy=remedy)
     try:
         # Local files only, and none that a playlist in the file could name.

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from vilp_data import history, journal, shards
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import StoreError, UsageError, VilpDataError
+from vilp_data.errors import StoreError, UsageError, VilpDataError, number_of
+from vilp_data.locate import has_been_dataset
 from vilp_data.staleness import run_encoder
 from vilp_data.writer_lock import leftovers, writer_lock
 
@@ -52,7 +53,7 @@ def collect_garbage(root: Path, *, keep: int = KEEP, runs: Sequence[Path] = (), 
     of `runs` that is no encoder's run."""
     if keep < 0:
         raise UsageError("a number of operations to keep is not negative", found=keep, remedy="0 keeps no undo at all")
-    if not (root / "dataset.json").is_file():
+    if not has_been_dataset(root):
         EpisodeStore(root).spec()  # says that it is none
     with writer_lock(root):
         store, report = EpisodeStore(root), GarbageReport()
@@ -68,7 +69,7 @@ def collect_garbage(root: Path, *, keep: int = KEEP, runs: Sequence[Path] = (), 
             _forget_states(root, floor)
             report.deleted = True
             if report.found:
-                note = f"{len(report.found)} files deleted, {size_text(report.size)}; undo back to {floor + 1}"
+                note = f"{number_of(len(report.found), 'file')} deleted, {size_text(report.size)}; undo back to {floor + 1}"
                 history.begin(root).record("gc", note)
     return report
 

@@ -16,7 +16,7 @@ from vilp_data import history, journal, shards
 from vilp_data.dataset_state import frames_name, steps_name
 from vilp_data.episode_entry import free_id
 from vilp_data.episodes import EpisodeEntry, EpisodeStore, write_steps
-from vilp_data.errors import StoreError, UsageError
+from vilp_data.errors import StoreError, UsageError, number_of
 from vilp_data.history import Changes
 from vilp_data.keys import first_difference
 from vilp_data.latents import latents_path
@@ -62,7 +62,7 @@ def merge_datasets(other: Path, into: Path) -> MergeReport:
         report.latents = sum(_take_latents(other, into, entry, id) for id, entry in wanted.items())
         if wanted:
             report.added = sorted(wanted)
-            note = f"{len(wanted)} episodes taken from {other}"
+            note = f"{number_of(len(wanted), 'episode')} taken from {other}"
             report.operation = history.begin(into).perform("merge", changes, note).number
         here.ensure_index()
     return report

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from vilp_data.dataset_split import find_split, split_by
 from vilp_data.dataset_state import frames_name, steps_name
 from vilp_data.edits import MIN_STEPS, relabelled, require_enough, trimmed
 from vilp_data.episodes import EpisodeEntry, EpisodeStore, write_steps
-from vilp_data.errors import SplitError, UsageError, nearest
+from vilp_data.errors import SplitError, UsageError, nearest, number_of
 from vilp_data.history import Changes
 from vilp_data.idle import IDLE_S, IDLE_SHARE, moving_range
 from vilp_data.removed import read_removed, removed_bytes, removed_episode, removed_path
@@ -44,7 +44,8 @@ class SurgeryReport:
 @dataclass(frozen=True)
 class Trim:
     """What a trim leaves of an episode: steps `first` to `end` (one past the last) of the `n_steps` there are now, the first of which is
-    step `counted_from` of the episode as it was ingested. `moves` False: nothing moves in it at all, and it is left as it is."""
+    step `counted_from` of the episode as it was ingested. `moves` False: nothing moves in it at all, and it is left as it is.
+    `past_end`: the range that was asked for goes on after its last step."""
 
     id: str
     first: int
@@ -53,6 +54,7 @@ class Trim:
     rate_hz: float
     counted_from: int = 0
     moves: bool = True
+    past_end: bool = False
 
     @property
     def cuts(self) -> bool:
@@ -123,10 +125,7 @@ def plan_trim(
     cuts = []
     for entry in _chosen(store, episodes):
         if steps is not None:
-            first, end, _ = slice(*steps).indices(entry.whole_steps)
-            first, end = max(first - entry.first_step, 0), min(end - entry.first_step, entry.n_steps)
-            require_enough(entry, _steps_of(store, entry), first, end)
-            cuts.append(_trim(entry, first, end))
+            cuts.append(_stated_trim(store, entry, steps))
         else:
             cuts.append(_idle_trim(store, entry, threshold, margin_s))
     return cuts
@@ -183,6 +182,28 @@ def _idle_trim(store: EpisodeStore, entry: EpisodeEntry, threshold: float, margi
     if end - first < MIN_STEPS or not steps["valid"][first:end].any():
         first, end = 0, entry.n_steps
     return _trim(entry, first, end)
+
+
+def _stated_trim(store: EpisodeStore, entry: EpisodeEntry, steps: tuple[int | None, int | None]) -> Trim:
+    asked_first, asked_end, _ = slice(*steps).indices(entry.whole_steps)
+    stated = ":".join("" if bound is None else str(bound) for bound in steps)
+    if asked_first >= asked_end:
+        remedy = "steps count from 0; the end is left out, and lies after the start"
+        found = f"{stated} of an episode of {entry.whole_steps} steps"
+        raise UsageError("no such range of steps", where=entry.id, found=found, remedy=remedy)
+    first, end = max(asked_first - entry.first_step, 0), min(asked_end - entry.first_step, entry.n_steps)
+    if first >= end:
+        left = f"{entry.first_step} to {entry.first_step + entry.n_steps - 1}"
+        remedy = "`vilp-data log` says by which operation; `vilp-data undo` brings them again"
+        raise UsageError(
+            "these steps were trimmed off before",
+            where=entry.id,
+            found=f"{stated}; steps {left} are left",
+            remedy=remedy,
+        )
+    require_enough(entry, _steps_of(store, entry), first, end)
+    past_end = steps[1] is not None and steps[1] > entry.whole_steps
+    return replace(_trim(entry, first, end), past_end=past_end)
 
 
 def _trim(entry: EpisodeEntry, first: int, end: int, *, moves: bool = True) -> Trim:
@@ -285,7 +306,7 @@ def _about_labels(lock: SplitLock | None, labels: Mapping[str, str], unset: Sequ
 def counted(ids: Sequence[str], limit: int = 3) -> str:
     """`2 episodes (a, b)`"""
     listed = ", ".join(ids[:limit]) + (", …" if len(ids) > limit else "")
-    return f"{len(ids)} episode{'' if len(ids) == 1 else 's'} ({listed})"
+    return f"{number_of(len(ids), 'episode')} ({listed})"
 
 
 def _chosen(store: EpisodeStore, episodes: Sequence[str], *, all_by_default: bool = True) -> list[EpisodeEntry]:

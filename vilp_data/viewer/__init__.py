@@ -16,7 +16,7 @@ import numpy as np
 from vilp_data.decode import is_wall_clock
 from vilp_data.decode.numeric_fields import numeric_series
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import DecodeError, LogError, UsageError, VilpDataError, nearest
+from vilp_data.errors import DecodeError, LogError, UsageError, VilpDataError, nearest, some_of
 from vilp_data.latents import BATCH, FrameEncoder, read_latents, stale_reason
 from vilp_data.plots import Plot, frame_psnr, panel_rank, vector_parts
 from vilp_data.sources import MessageError, open_log
@@ -29,6 +29,8 @@ from vilp_data.viewer.window import present
 __all__ = ["Drawn", "draw_episode", "draw_log", "present"]
 
 ERROR_GAIN = 4  # error images are this much brighter than the error, to be seen at all
+
+SHOWN_WHOLE = 8  # names of episodes that have all their files
 
 Progress = Callable[[int], None]
 
@@ -74,7 +76,7 @@ def draw_log(
     array_rate_hz: float = 10.0,
     progress: Progress | None = None,
 ) -> Drawn:
-    """Draw one demonstration of a log (the first unless named) into `rrd`, written whole or not at all.
+    """Draw one demonstration of a log (unless named the first that has all its files) into `rrd`, written whole or not at all.
 
     Every image topic becomes a panel, every other topic its numbers. Recorded JPEG and PNG bytes go in as they are. With a
     `spec`, its action topics come first. `progress` is told messages as they are read. Topics and messages that cannot be read
@@ -105,10 +107,18 @@ def _choose(log: LogReader, name: str | None) -> tuple[LogEpisode, tuple[str, ..
         raise LogError("no messages in this log", where=log.path, remedy="`vilp-data inspect` shows what it holds")
     if name is not None and name not in episodes:
         raise UsageError(f"no episode {name!r} in this log", where=log.path, remedy=nearest(name, episodes))
-    chosen = episodes[name] if name is not None else next(iter(episodes.values()))
     if len(episodes) == 1 or name is not None:
-        return chosen, ()
-    return chosen, (f"{log.path}: {len(episodes)} episodes, showing {chosen.name}; --episode NAME shows another",)
+        return episodes[name or next(iter(episodes))], ()
+    whole: list[str] | None = getattr(
+        log, "whole", None
+    )  # of formats that keep an episode's parts in files of their own
+    chosen = episodes[(whole or list(episodes))[0]]
+    counted = f"{len(episodes)} episodes"
+    if whole is not None and len(whole) < len(episodes):
+        counted += (
+            f", of which {some_of(whole, SHOWN_WHOLE) or 'none'} {'has' if len(whole) == 1 else 'have'} all their files"
+        )
+    return chosen, (f"{log.path}: {counted}, showing {chosen.name}; --episode NAME shows another",)
 
 
 def _draw_messages(

@@ -141,6 +141,10 @@ class Canvas:
         self._pieces.add(self._stream.read() or b"")
         yield from self._pieces.blocks()
 
+    def discard(self) -> None:
+        """Take out what was drawn and nobody will read: else Rerun complains of it on the terminal when it closes."""
+        self._stream.read()
+
     def close(self) -> None:
         self._recording.disconnect()
         self._pieces.close()
@@ -189,6 +193,9 @@ def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
         with shards.atomic_file(rrd) as file:
             for block in canvas.blocks():
                 file.write(block)
+    except BaseException:
+        canvas.discard()
+        raise
     finally:
         canvas.close()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from vilp_data.cli.options import PresetOption
@@ -39,17 +41,19 @@ def train_vqgan(
     from vilp_models.train import train_vqgan as train
 
     root, spec = dataset_of(data, task, preset)
+    folder = run or default_run(root, "vqgan", preset)
     episodes = side_episodes(EpisodeStore(root), "train")
     recipe = vqgan_recipe(spec.models, preset=preset, where=spec.name)
     train(
         root,
         spec,
         recipe,
-        run or default_run(root, "vqgan", preset),
+        folder,
         train_episodes=[entry.id for entry in episodes],
         split_hash=read_split(root).hash,
         restart=restart,
     )
+    _say_where(folder)
 
 
 @app.command("planner")
@@ -73,6 +77,7 @@ def train_planner(
     folder = run or default_run(root, "planner", preset)
     vqgan_run = find_model_run(root, "vqgan", given=vqgan, preset=preset, option="--vqgan")
     train(root, spec, recipe, folder, vqgan=vqgan_run, restart=restart)
+    _say_where(folder)
 
 
 @app.command("policy")
@@ -101,6 +106,7 @@ def train_policy(
     if recipe.sees == "latents" or recipe.reconstructed_share > 0:
         vqgan_run = find_model_run(root, "vqgan", given=vqgan, preset=preset, option="--vqgan")
     train(root, spec, recipe, folder, vqgan=vqgan_run, action_set=action_set, restart=restart)
+    _say_where(folder)
 
 
 @app.command("bc")
@@ -124,3 +130,8 @@ def train_bc(
     vilp = load_recipe(VilpRecipe, "vilp", spec.models, preset=preset, where=spec.name)
     folder = run or default_run(root, "bc", preset, action_set)
     train(root, spec, recipe, folder, n_action_steps=vilp.n_action_steps, action_set=action_set, restart=restart)
+    _say_where(folder)
+
+
+def _say_where(folder: Path) -> None:
+    print(f"the run: {folder}")
