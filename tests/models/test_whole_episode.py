@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
-from vilp_data.generated_episode import GeneratedEpisode, Maker, open_generated_episode
-from vilp_models.whole_episode import WholeRequest, imagine_whole
 
 from tests.models.test_vilp import observation, vilp
 from tests.models.trained_cards import N_ACTION_STEPS, PRESET, TrainedCards
@@ -21,11 +19,13 @@ from vilp_data.dataset_split import read_split
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, VilpDataError
+from vilp_data.generated_episode import GeneratedEpisode, Maker, open_generated_episode
 from vilp_data.latents import open_latents
 from vilp_data.plots import frame_psnr
 from vilp_models.cli import app
 from vilp_models.lpips import Lpips
 from vilp_models.policies.base import Observation
+from vilp_models.whole_episode import WholeRequest, imagine_whole
 
 STRIDE = 2
 MAKER = Maker({}, {}, ())
