@@ -9,9 +9,11 @@ Salvage also inflates what they leave, checks every checksum, and writes the cle
 
 from __future__ import annotations
 
+import os
 import random
 import re
 import shutil
+import signal
 import sqlite3
 import struct
 import subprocess
@@ -103,9 +105,13 @@ def rerun_count(path: Path) -> int:
     out = path.with_name("out.rrd")
     out.unlink(missing_ok=True)
     command = [str(RERUN), "mcap", "convert", "--recover", "-d", "raw", str(path), "-o", str(out)]
+    # A session of its own: the command starts another process, which would go on alone where only the first is killed.
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        subprocess.run(command, capture_output=True, timeout=PATIENCE_S)
+        running.wait(PATIENCE_S)
     except subprocess.TimeoutExpired:
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
         return 0
     if not out.exists():
         return 0
