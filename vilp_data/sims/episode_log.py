@@ -122,5 +122,5 @@ def _needs_own_writer(where: str, found: str) -> UsageError:
         "an episode of this task cannot be written as plain arrays",
         where=where,
         found=found,
-        remedy="give its environment a method write_tick(log, stamp_ns, observation, info, action), as HanoiEnv has",
+        remedy="give its environment a method write_tick(log, stamp_ns, observation, info, action), as ArmEnv has",
     )
