@@ -29,7 +29,7 @@ SUDO  := $(if $(filter 0,$(shell id -u)),,$(shell command -v sudo >/dev/null && 
 
 export MUJOCO_GL ?= osmesa
 
-.PHONY: setup record ingest split vqgan latents actions planner policy bc generate rollout view replay test test-slow fuzz lint bench docs clean help
+.PHONY: setup record ingest split vqgan latents actions planner policy bc generate rollout compare view replay test test-slow fuzz lint bench docs clean help
 
 help:
 	@sed -n '1,11p' Makefile
@@ -81,6 +81,11 @@ generate: planner
 rollout: planner policy
 	@$(BIN)/vilp-models rollout $(MODEL) --policy stay --seeds $(SEEDS)
 	@$(BIN)/vilp-models rollout $(MODEL) $(LABELS) --policy vilp --seeds $(SEEDS)
+
+# do off-target labels help? three seeds of each model on both sets: hours, and it goes on where it stopped
+compare: planner
+	@for set in small hybrid; do $(BIN)/vilp-data actions --recipe $$set --preset $(PRESET) --data $(DATA) || exit 1; done
+	@$(BIN)/vilp-models compare $(MODEL) --sets small,hybrid --seeds $(SEEDS)
 
 # the newest log there is, of a policy or of the recorder; without any, the first ingested episode
 view: $(READY)

@@ -1,11 +1,11 @@
-"""`vilp-models`: train, evaluate, imagine, roll out. Thin: one file a verb, which parses, calls, prints."""
+"""`vilp-models`: train, evaluate, imagine, roll out, compare. Thin: one file a verb, which parses, calls, prints."""
 
 from __future__ import annotations
 
 import typer
 
 from vilp_data.cli import run_app
-from vilp_models.cli import evaluate, generate, rollout, train
+from vilp_models.cli import compare, evaluate, generate, rollout, train
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -18,6 +18,7 @@ app.add_typer(train.app, name="train")
 app.add_typer(evaluate.app, name="evaluate")
 app.command()(generate.generate)
 app.command()(rollout.rollout)
+app.command()(compare.compare)
 
 
 def main() -> None:

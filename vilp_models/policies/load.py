@@ -37,6 +37,7 @@ class PolicyRequest:
     device      where all of its networks run
     recordings  those that episodes start from, by policy seed; none where the simulator draws the starts
     vqgan       the run of the VQGANs, where another than the preset's
+    runs        "policy", "bc", "planner" -> its run, where another than the preset's
     action_set  the set that its low-level policy, or its cloned behaviour, learnt from (runs/policy-PRESET-SET, …)
     denoising_steps, sampler, precision
                 of a policy that imagines, as `VilpPolicy` takes them
@@ -49,6 +50,7 @@ class PolicyRequest:
     device: str = "cpu"
     recordings: Mapping[int, Recording] = field(default_factory=dict)
     vqgan: Path | None = None
+    runs: Mapping[str, Path] = field(default_factory=dict)
     action_set: str | None = None
     denoising_steps: int | None = None
     sampler: Sampler | None = None
@@ -58,6 +60,8 @@ class PolicyRequest:
         """Folder of the runs of one kind of model. Raises UsageError where there is none, or it is not clear which."""
         if kind == "vqgan":
             return find_model_run(self.root, kind, given=self.vqgan, preset=self.preset, option="--vqgan")
+        if kind in self.runs:
+            return self.runs[kind]
         action_set = self.action_set if kind in LEARNS_FROM_ACTIONS else None
         return find_model_run(self.root, kind, preset=self.preset, action_set=action_set, option="--preset")
 
