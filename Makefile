@@ -1,9 +1,10 @@
 # make latents TASK=hanoi        episode logs -> cached VQGAN latents, everything before it included
 # make rollout TASK=pusht LOGS=… … -> planner and low-level policy -> VILP in the simulator, everything before it included
 # make policy TASK=pusht SET=small … the low-level policy (bc, rollout too) learns from an action set's episodes alone
+# make compare TASK=… dream …     do off-target labels help, with intervals; real beside imagined episodes as one page
 # make test                      lint, types, import rules, tests
 #
-# TASK    a task in pipelines/: arrange_blocks, hanoi, pusht      PRESET  tiny | cpu | paper
+# TASK    a task in pipelines/: arrange_blocks, can, hanoi, move_the_stack, nut_assembly, pusht      PRESET  tiny | cpu | paper
 # SET     an action set: small, hybrid, off_target, or a recipe TOML; without, all training episodes with actions give labels
 # LOGS    your own logs (files or folders) instead of recorded ones
 # SEEDS   which starts a rollout has, FIRST:END   TORCH   what pip installs as torch
@@ -29,10 +30,10 @@ SUDO  := $(if $(filter 0,$(shell id -u)),,$(shell command -v sudo >/dev/null && 
 
 export MUJOCO_GL ?= osmesa
 
-.PHONY: setup record ingest split vqgan latents actions planner policy bc generate rollout compare view replay test test-slow fuzz lint bench docs clean help
+.PHONY: setup record ingest split vqgan latents actions planner policy bc generate dream rollout compare view replay test test-slow fuzz lint bench docs clean help
 
 help:
-	@sed -n '1,11p' Makefile
+	@sed -n '1,12p' Makefile
 
 # --- set-up ----------------------------------------------------------------------------------------------------------
 
@@ -77,6 +78,11 @@ bc: split $(if $(SET),actions)
 
 generate: planner
 	@$(BIN)/vilp-models generate $(MODEL)
+
+# whole held-out episodes as VILP would act on them, real beside imagined, on one page
+dream: planner policy
+	@$(BIN)/vilp-models generate $(MODEL) $(LABELS) --whole
+	@$(BIN)/vilp-data view --generated planner-$(PRESET)$(if $(SET),-$(basename $(notdir $(SET)))) --data $(DATA) --html $(DATA)/dream.html
 
 rollout: planner policy
 	@$(BIN)/vilp-models rollout $(MODEL) --policy stay --seeds $(SEEDS)
