@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import sqlite3
+import struct
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,6 +51,63 @@ def write_log(path: Path, *, n: int = 150, size: int = 200, extras: bool = True,
                 writer.add_attachment(7, 5, "calibration.bin", "application/x", b"abc" * 300)
                 writer.add_metadata("episode", {"success": "true"})
         writer.finish()
+    return sent
+
+
+def write_db3(
+    path: Path,
+    *,
+    n: int = 400,
+    journal: str = "DELETE",
+    longest: int = 2000,
+    page: int = 4096,
+    reserved: int = 0,
+    distro: str = "",
+) -> list[Sent]:
+    """A file as rosbag2 writes it, of std_msgs/String; `reserved` bytes of each page are not SQLite's."""
+    rng, sent = random.Random(0), []
+    path.unlink(missing_ok=True)
+    database = sqlite3.connect(path, isolation_level=None)
+    database.execute(f"PRAGMA page_size={page}")
+    if reserved:
+        database.execute("PRAGMA user_version=1")
+        with path.open("r+b") as stream:  # before the first table
+            stream.seek(20)
+            stream.write(bytes([reserved]))
+            stream.seek(105)  # where the first page's rows would end
+            stream.write((page - reserved).to_bytes(2, "big"))
+        database.close()
+        database = sqlite3.connect(path, isolation_level=None)
+    database.execute(f"PRAGMA journal_mode={journal}")
+    database.execute(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,"
+        " serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"
+    )
+    database.execute(
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
+    )
+    database.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+    for i in range(3):
+        database.execute("INSERT INTO topics VALUES(?, ?, 'std_msgs/msg/String', 'cdr', '')", (i + 1, f"/t{i}"))
+    if distro:
+        database.execute("CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)")
+        database.execute("INSERT INTO schema VALUES(4, ?)", (distro,))
+    database.execute("BEGIN")
+    for k in range(n):
+        text = "".join(rng.choices("abcdefgh", k=rng.randrange(1, longest))).encode() + b"\0"
+        data = b"\0\1\0\0" + struct.pack("<I", len(text)) + text
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", (k % 3 + 1, 1000 + k, data))
+        sent.append(Sent(f"/t{k % 3}", 1000 + k, 1000 + k, 0, data))
+    database.execute("COMMIT")
+    if journal == "WAL":
+        kept = path.with_name("kept-wal")
+        kept.write_bytes(path.with_name(path.name + "-wal").read_bytes())
+        main = path.read_bytes()
+        database.close()
+        path.write_bytes(main)
+        kept.rename(path.with_name(path.name + "-wal"))
+    else:
+        database.close()
     return sent
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import sqlite3
 import struct
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -14,55 +15,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from tests.damage import Sent, cuts, invented, mutated, read_log, salvaged
+from tests.damage import Sent, cuts, invented, mutated, read_log, salvaged, write_db3
 from tests.real_data import real_data
+from vilp_data import limits
 from vilp_data.errors import LogError
 from vilp_data.salvage import salvage_log
 from vilp_data.sources import open_log
 from vilp_data.sources.db3_salvage import RowRanges
 
 HUMBLE = get_typestore(Stores.ROS2_HUMBLE)
-
-
-def write_db3(
-    path: Path, *, n: int = 400, journal: str = "DELETE", longest: int = 2000, page: int = 4096, distro: str = ""
-) -> list[Sent]:
-    """A file as rosbag2 writes it, of std_msgs/String."""
-    rng, sent = random.Random(0), []
-    path.unlink(missing_ok=True)
-    database = sqlite3.connect(path, isolation_level=None)
-    database.execute(f"PRAGMA page_size={page}")
-    database.execute(f"PRAGMA journal_mode={journal}")
-    database.execute(
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,"
-        " serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL)"
-    )
-    database.execute(
-        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
-    )
-    database.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
-    for i in range(3):
-        database.execute("INSERT INTO topics VALUES(?, ?, 'std_msgs/msg/String', 'cdr', '')", (i + 1, f"/t{i}"))
-    if distro:
-        database.execute("CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)")
-        database.execute("INSERT INTO schema VALUES(4, ?)", (distro,))
-    database.execute("BEGIN")
-    for k in range(n):
-        text = "".join(rng.choices("abcdefgh", k=rng.randrange(1, longest))).encode() + b"\0"
-        data = b"\0\1\0\0" + struct.pack("<I", len(text)) + text
-        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", (k % 3 + 1, 1000 + k, data))
-        sent.append(Sent(f"/t{k % 3}", 1000 + k, 1000 + k, 0, data))
-    database.execute("COMMIT")
-    if journal == "WAL":
-        kept = path.with_name("kept-wal")
-        kept.write_bytes(path.with_name(path.name + "-wal").read_bytes())
-        main = path.read_bytes()
-        database.close()
-        path.write_bytes(main)
-        kept.rename(path.with_name(path.name + "-wal"))
-    else:
-        database.close()
-    return sent
+STEPS = [pytest.param(12, id="some"), pytest.param(100, id="every percent", marks=pytest.mark.slow)]
+SHAPES: dict[str, dict[str, Any]] = {
+    "many small rows": {"n": 1500, "longest": 40},
+    "rows of about a page": {"n": 300},
+    "rows of several pages": {"n": 40, "longest": 20_000},
+    "the smallest pages": {"n": 100, "page": 512},
+    "the largest pages": {"n": 30, "longest": 60_000, "page": 65536},
+    "bytes that are not SQLite's": {"n": 100, "page": 1024, "reserved": 40},
+}
 
 
 def test_a_whole_db3_becomes_an_mcap_that_carries_its_definitions(tmp_path: Path) -> None:
@@ -76,17 +46,127 @@ def test_a_whole_db3_becomes_an_mcap_that_carries_its_definitions(tmp_path: Path
         assert next(iter(log.messages(["/t0"]))).body.data == sent[0].data[8:-1].decode()
 
 
-def test_a_db3_cut_short_gives_the_rows_that_are_left(tmp_path: Path) -> None:
-    path, before = tmp_path / "run.db3", -1
-    sent = write_db3(path)
+@pytest.mark.parametrize("steps", STEPS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_cut_db3_gives_every_row_whose_pages_are_there_and_never_fewer_as_more_bytes_are_there(
+    tmp_path: Path, shape: str, steps: int
+) -> None:
+    path, before = tmp_path / "run.db3", 0
+    sent = write_db3(path, **SHAPES[shape])
     content = path.read_bytes()
-    for part in cuts(content, steps=8)[1:]:
+    ends = [last_byte(content, message.data) for message in sent]
+    page = SHAPES[shape].get("page", 4096)
+    for part in cuts(content, steps=steps):
         found, report = salvaged(tmp_path / "cut.db3", part)
-        assert invented(found, sent) == 0
-        assert len(found) >= before
+        assert not invented(found, sent)
+        assert found == sorted(found, key=lambda message: message.log_time_ns)
+        there = len(part) // page * page
+        assert len(found) >= max(before, sum(end <= there for end in ends))
         assert report is None or report.complete == (len(part) == len(content))
         before = len(found)
     assert before == len(sent)
+
+
+def last_byte(content: bytes, data: bytes) -> int:
+    """Where a message ends in a file, piece by piece, found by its bytes alone: the latest place where a piece is in several."""
+    done = last = 0
+    while done < len(data):
+        place = content.rindex(data[done : done + 24])
+        same = 0
+        while done + same < len(data) and content[place + same] == data[done + same]:
+            same += 1
+        done, last = done + same, max(last, place + same)
+    return last
+
+
+def test_what_a_journal_holds_of_a_cut_db3_comes_back_and_nothing_else_behind_the_cut(tmp_path: Path) -> None:
+    """The journal's pages go where they belong, behind the cut; between them lies nothing, nor in the page that is cut."""
+    sent, content, journal = write_journalled(tmp_path / "run.db3", n=100, more=20)
+    ends = [last_byte(content, message.data) for message in sent[:100]]
+    for page in range(40, 50):
+        (tmp_path / "cut.db3-wal").write_bytes(journal)
+        found, report = salvaged(tmp_path / "cut.db3", content[: page * 4096 + 4000])
+        assert not invented(found, sent)
+        assert found[-20:] == sent[-20:]
+        assert sum(end <= page * 4096 for end in ends) <= len(found) - 20 < 100
+        assert report is not None
+        assert not report.complete
+        assert "cut off" in report.doubts[0]
+
+
+def test_a_journal_that_is_too_far_behind_the_cut_is_not_said_to_be_taken_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "RECORD_BYTES", 1 << 16)
+    sent, content, journal = write_journalled(tmp_path / "run.db3", n=200, more=2)
+    (tmp_path / "cut.db3-wal").write_bytes(journal)
+    found, report = salvaged(tmp_path / "cut.db3", content[: len(content) // 10])
+    assert 10 < len(found) < 30
+    assert not invented(found, sent)
+    assert report is not None
+    assert "cut.db3-wal could not be taken in" in report.doubts[-1]
+    assert not report.notes
+
+
+def write_journalled(path: Path, *, n: int, more: int) -> tuple[list[Sent], bytes, bytes]:
+    """What was sent, a file of `n` messages, and a journal of `more`, which no checkpoint has put into the file."""
+    sent = write_db3(path, n=n, longest=9000)
+    database = sqlite3.connect(path, isolation_level=None)
+    database.execute("PRAGMA journal_mode=WAL")
+    for k in range(n, n + more):
+        data = bytes([k]) * 9000
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", (1000 + k, data))
+        sent.append(Sent("/t0", 1000 + k, 1000 + k, 0, data))
+    content, journal = path.read_bytes(), path.with_name("run.db3-wal").read_bytes()
+    database.close()
+    return sent, content, journal
+
+
+def test_a_rolled_back_transaction_of_a_cut_db3_leaves_no_row(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent = write_db3(path, n=200, longest=9000)
+    database = sqlite3.connect(path, isolation_level=None)
+    database.execute("PRAGMA cache_size = 5")  # so that pages are written before the commit
+    database.execute("BEGIN")
+    database.execute("UPDATE messages SET data = zeroblob(9000)")
+    content, journal = path.read_bytes(), path.with_name("run.db3-journal").read_bytes()
+    database.close()
+    path.with_name("cut.db3-journal").write_bytes(journal)
+    found, report = salvaged(tmp_path / "cut.db3", content[: len(content) // 2])
+    assert report is not None
+    assert not invented(found, sent)
+    assert len(found) > 80
+
+
+def test_a_head_that_claims_the_most_pages_there_can_be_costs_no_row_and_no_time(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent = write_db3(path)
+    content = bytearray(path.read_bytes())
+    content[28:32] = b"\xff" * 4
+    begin = time.monotonic()
+    found, report = salvaged(path, bytes(content))
+    assert time.monotonic() - begin < 5
+    assert found == sent
+    assert report is not None
+    assert not report.complete
+
+
+def test_a_journal_that_makes_the_file_a_terabyte_costs_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rolling back restores the size that a journal names; a file system stores no zeros for it."""
+    monkeypatch.setattr(limits, "RECORD_BYTES", 1 << 24)
+    path = tmp_path / "run.db3"
+    write_db3(path, n=50)
+    content = path.read_bytes()
+    head = bytes.fromhex("d9d505f920a163d7") + struct.pack(">5I", 0, 1, 1 << 28, 512, 4096)
+    path.with_name("run.db3-journal").write_bytes(head.ljust(512, b"\0"))
+    begin = time.monotonic()
+    found, report = salvaged(path, content[: len(content) // 2])
+    assert time.monotonic() - begin < 5
+    assert 10 < len(found) < 50
+    assert report is not None
+    assert "VILP_MAX_RECORD_BYTES" in report.doubts[-1]
 
 
 def test_a_damaged_page_costs_the_rows_in_it(tmp_path: Path) -> None:
@@ -239,6 +319,31 @@ def test_a_type_that_the_bag_does_not_define_is_that_of_its_own_release(
             (message,) = log.messages(["/t0"])
         assert message.body.range == 1.5
         assert hasattr(message.body, "variance") == has_variance
+
+
+def test_a_definition_or_a_name_that_is_not_all_there_is_none(tmp_path: Path) -> None:
+    """SQLite answers with zeros for bytes that a file lacks."""
+    path = tmp_path / "run.db3"
+    sent = write_db3(path, n=30)
+    database = sqlite3.connect(path)
+    database.execute(
+        "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, encoding TEXT,"
+        " encoded_message_definition TEXT, type_description_hash TEXT)"
+    )
+    damaged = "string data\n" + "\0" * 50
+    database.execute("INSERT INTO message_definitions VALUES(1, 'std_msgs/msg/String', 'ros2msg', ?, '')", (damaged,))
+    database.execute("UPDATE topics SET name = ? WHERE id = 2", ("/t\0\0",))
+    database.commit()
+    database.close()
+    found, report = salvaged(path)
+    assert found == [message for message in sent if message.topic != "/t1"]
+    assert report is not None
+    assert not report.complete
+    text = " ".join(report.doubts)
+    assert "'std_msgs/msg/String' is damaged" in text
+    assert "a topic's row is damaged" in text
+    with open_log(path.with_suffix(".salvaged")) as log:
+        assert next(iter(log.messages(["/t0"]))).body.data == sent[0].data[8:-1].decode()
 
 
 # --- what is remembered -----------------------------------------------------------------------------------------------

@@ -1,13 +1,17 @@
-"""As much of a damaged ROS 2 bag in SQLite as SQLite gives, into a clean MCAP.
+"""As much of a damaged ROS 2 bag in SQLite as its pages hold, into a clean MCAP.
 
 The file is copied first, with the journal beside it: opening it there lets SQLite finish or roll back what the recorder had begun,
-and leaves the bag as it was. A copy that is cut off is filled up with zeros, since SQLite reads no file that is shorter than it says.
+and leaves the bag as it was.
+
 Rows are read from the table itself, from both ends towards the damage, and then around it; never through the index of times, which
-may lack some. Whether the table has all its rows, SQLite's own check of its trees says.
+may lack some. Whether the table has all its rows, SQLite's own check of its trees says. Where anything is damaged, every page is looked
+through for rows that no tree leads to (`sqlite_pages`). Of a file that is cut off, SQLite is asked for the descriptions alone, and the
+pages give the messages: where a page is missing SQLite may answer with zeros, and it cannot tell which rows are not all there.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -27,7 +31,9 @@ from vilp_data.sources.file_bytes import FileBytes
 from vilp_data.sources.mcap_clean import CleanMcap
 from vilp_data.sources.mcap_records import MESSAGE_HEAD
 from vilp_data.sources.message_decoders import BEFORE_DEFINITIONS, stock_definition
+from vilp_data.sources.sqlite_pages import HEAD_SIZE, file_head, message_rows
 
+JOURNALS = ("-wal", "-journal")
 PROBES = 2000  # queries spent on damaged parts of the table
 STEP, STEP_BYTES = 1000, 1 << 24  # rows that are turned around at a time, and their bytes
 LOWEST, HIGHEST = -(1 << 63), (1 << 63) - 1  # of SQLite's row ids
@@ -73,7 +79,9 @@ class Db3Salvage:
         self._unknown: Counter[int] = Counter()
         self._seen = RowRanges()
         self._probes = 0
-        self._damaged = False
+        self._damaged = self._cut_off = False
+        self._beside: list[str] = []  # suffixes of the journals
+        self._bytes = source.size  # and those of the journals beside it, which may add as many to the file
 
     def run(self) -> None:
         self._clean.start("ros2", "")
@@ -83,35 +91,57 @@ class Db3Salvage:
                 database.execute("PRAGMA trusted_schema = OFF")
                 database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(limits.RECORD_BYTES, (1 << 31) - 1))
                 database.text_factory = lambda data: data.decode(errors="replace")
+                if self._cut_off:  # else SQLite opens no file that is shorter than it says
+                    database.execute("PRAGMA writable_schema = ON")
                 self._set_budget(database)
                 self._describe(database)
-                self._read(database)
-                self._set_budget(database)
-                self._check(database)
+                if not self._cut_off:
+                    self._read(database)
+                    self._set_budget(database)
+                    self._check(database)
+            self._note_journals(copy)
+            if self._damaged:
+                self._read_pages(copy)
         self._conclude()
 
     def _copied(self, folder: Path) -> Path:
         copy = folder / "log.db3"
         shutil.copyfile(self._source.path, copy)
-        for suffix in ("-wal", "-journal"):
+        for suffix in JOURNALS:
             beside = self._source.path.with_name(self._source.path.name + suffix)
             if beside.is_file() and beside.stat().st_size:
                 shutil.copyfile(beside, copy.with_name(copy.name + suffix))
-                self._report.note(f"{beside.name}, which the recorder left, was taken in")
-        head = self._source.at(0, 100)
-        page = int.from_bytes(head[16:18], "big")
-        wanted = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")
-        same = head[24:28] == head[92:96]
-        if same and self._source.size < wanted <= self._source.size + limits.RECORD_BYTES:
-            with copy.open("r+b") as stream:
-                stream.truncate(wanted)
-            self._damaged = True
-            self._report.doubt(f"the file is cut off: {self._source.size:,} of {wanted:,} bytes")
+                self._bytes += beside.stat().st_size
+                self._beside.append(suffix)
+        self._cut(copy)
         return copy
+
+    def _note_journals(self, copy: Path) -> None:
+        """What became of the journals: a WAL that was taken in is deleted, while another journal may stay though nothing is left of it."""
+        for suffix in self._beside:
+            name = self._source.path.name + suffix
+            if suffix == "-wal" and copy.with_name(copy.name + suffix).exists():
+                self._damaged = True
+                self._report.doubt(f"{name} could not be taken in")
+            else:
+                self._report.note(f"{name}, which the recorder left, was taken in")
+
+    def _cut(self, copy: Path) -> None:
+        """Where the file is shorter than its pages are, leave nothing of the last one in the copy."""
+        head, size = file_head(self._source.at(0, HEAD_SIZE)), self._source.size
+        if head is None:
+            return
+        wanted = (head.pages or -(-size // head.page_size)) * head.page_size
+        if size < wanted:
+            os.truncate(copy, size - size % head.page_size)
+            if self._beside:  # SQLite puts no journal's pages far behind a file's end
+                os.truncate(copy, min(wanted, size + limits.RECORD_BYTES))
+            self._damaged = self._cut_off = True
+            self._report.doubt(f"the file is cut off: {size:,} of {wanted:,} bytes")
 
     def _set_budget(self, database: sqlite3.Connection) -> None:
         """What comes next ends, whatever circles the file's trees lead in: a query that does too much counts as damaged."""
-        self._budget = TOTAL * (self._source.size + INSTRUCTIONS)
+        self._budget = TOTAL * (self._bytes + INSTRUCTIONS)
 
         def spent() -> int:
             self._budget -= INSTRUCTIONS
@@ -123,21 +153,25 @@ class Db3Salvage:
 
     def _describe(self, database: sqlite3.Connection) -> None:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        definitions = {str(name): (str(encoding), str(text)) for name, encoding, text in self._some(database, query)}
+        definitions = {}
+        for name, encoding, text in self._some(database, query):
+            if _are_texts(name, encoding, text):
+                definitions[name] = (encoding, text)
+            else:
+                self._report.doubt(f"the definition of {name!r} is damaged")
         release = next((str(row[0]) for row in self._some(database, "SELECT ros_distro FROM schema")), "")
         for number, topic, name, serialization in self._some(
             database, "SELECT id, name, type, serialization_format FROM topics NOT INDEXED ORDER BY id", needed=True
         ):
-            if not isinstance(number, int) or not 0 <= number <= 0xFFFE or not isinstance(topic, str):
+            if not isinstance(number, int) or not 0 <= number <= 0xFFFE or not _are_texts(topic, name, serialization):
+                self._damaged = True
                 self._report.doubt("a topic's row is damaged")
                 continue
-            encoding, text = definitions.get(str(name), ("", ""))
-            if not text.strip() and (stock := stock_definition(release or BEFORE_DEFINITIONS, str(name))):
+            encoding, text = definitions.get(name, ("", ""))
+            if not text.strip() and (stock := stock_definition(release or BEFORE_DEFINITIONS, name)):
                 encoding, text = "ros2msg", stock
-            schema = Schema(id=number + 1, name=str(name), encoding=encoding, data=text.encode())
-            channel = Channel(
-                id=number, topic=topic, message_encoding=str(serialization), metadata={}, schema_id=number + 1
-            )
+            schema = Schema(id=number + 1, name=name, encoding=encoding, data=text.encode())
+            channel = Channel(id=number, topic=topic, message_encoding=serialization, metadata={}, schema_id=number + 1)
             self._channels[number] = self._clean.describe(channel, schema)
 
     def _some(self, database: sqlite3.Connection, query: str, *, needed: bool = False) -> Iterator[tuple[Any, ...]]:
@@ -171,7 +205,7 @@ class Db3Salvage:
     def _highest(self, database: sqlite3.Connection) -> int:
         """The highest row id there may be, where the end of the table cannot be read: as the index of times says, or as there is room
         for: recorders count from 1."""
-        highest: int = self._source.size
+        highest = self._bytes
         try:
             (row,) = database.execute("SELECT MAX(rowid) FROM messages INDEXED BY timestamp_idx").fetchall()
             highest = max(highest, row[0] or 0)
@@ -234,6 +268,21 @@ class Db3Salvage:
         topic.unverified += 1
         self._clean.message(channel_id, MESSAGE_HEAD.pack(channel_id, 0, time_ns, time_ns) + data)
 
+    def _read_pages(self, copy: Path) -> None:
+        """Take the rows that are in the copy's pages and were not met yet."""
+        before = self._report.recovered
+        # A journal may put pages anywhere behind a cut, with a hole before them that takes no bytes of the disk, but time.
+        size, most = copy.stat().st_size, self._bytes + limits.RECORD_BYTES
+        if size > most:
+            size = most
+            self._report.doubt("a journal's pages far behind the cut were not looked at (VILP_MAX_RECORD_BYTES)")
+        with copy.open("rb") as stream:
+            for row in message_rows(stream, size, whole=self._source.size, largest=limits.RECORD_BYTES):
+                self._take(*row)
+        found = self._report.recovered - before
+        if found and not self._cut_off:
+            self._report.doubt(f"{found:,} messages lie in pages that no table leads to any more")
+
     def _check(self, database: sqlite3.Connection) -> None:
         """Doubt everything where SQLite's own check finds the file's trees damaged: rows may be missing that no query misses."""
         try:
@@ -262,3 +311,8 @@ class Db3Salvage:
         report.ended = not self._damaged
         report.amount_known = report.amount_known and not self._damaged
         report.settle()
+
+
+def _are_texts(*values: Any) -> bool:
+    """Whether these are texts of which all is there: SQLite may answer with zeros for a page that is not."""
+    return all(isinstance(value, str) and "\0" not in value for value in values)
