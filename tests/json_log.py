@@ -29,10 +29,10 @@ def stamp(t_s: float) -> dict[str, int]:
     return {"sec": (START_NS + round(t_s * S)) // S, "nsec": (START_NS + round(t_s * S)) % S}
 
 
-def write_json_log(path: Path, said: Iterable[Said]) -> Path:
+def write_json_log(path: Path, said: Iterable[Said], *, chunk_size: int = 50_000) -> Path:
     """An MCAP file of these messages, in order of time."""
     with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=50_000)
+        writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=chunk_size)
         writer.start(library="json log")
         channels: dict[tuple[str, str], int] = {}
         for message in sorted(said, key=lambda message: message.t_s):

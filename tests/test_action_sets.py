@@ -190,15 +190,28 @@ def test_a_preset_overrides_a_recipe() -> None:
         parse_recipe(text.replace("tiny", "tinny"), where="x")
 
 
+RECORDED = {  # task: what its own episodes are tagged, and those of its variants
+    "arrange_blocks": {None: {"object": "gray_blocks"}, "off_target": {"object": "purple_blocks"}},
+    "nut_assembly": {
+        None: {"goal": "square_peg", "object": "square_nut"},
+        "other_goals": {"goal": "round_peg", "object": "square_nut"},
+        "other_objects": {"goal": "round_peg", "object": "round_nut"},
+    },
+    "pusht": {None: {"goal": "256,256,45"}, "off_target": {"goal": "356,356,45"}},
+}
+
+
+@pytest.mark.parametrize("preset", ["tiny", None])
 @pytest.mark.parametrize("name", ["small", "hybrid", "off_target"])
-@pytest.mark.parametrize("task", ["arrange_blocks", "pusht"])
-def test_the_tiny_recipes_fit_what_is_recorded_for_tiny(task: str, name: str) -> None:
-    record = load_task(task, preset="tiny").record
-    here, there = {"object": "gray_blocks", "goal": "256,256,45"}, {"object": "purple_blocks", "goal": "356,356,45"}
-    recorded = episodes(record.episodes, here) + episodes(record.variants["off_target"].episodes, there, prefix="p")
-    one_less_of_each = [one for one in recorded if one.id not in ("e000", "p000")]  # which validate
-    chosen = choose(load_recipe(name, task, preset="tiny")[1], one_less_of_each, where="data")
-    assert all(chosen.values())
+@pytest.mark.parametrize("task", RECORDED)
+def test_the_recipes_fit_what_is_recorded(task: str, name: str, preset: str | None) -> None:
+    record, trains = load_task(task, preset=preset).record, []
+    for variant, tags in RECORDED[task].items():
+        n = record.episodes if variant is None else record.variants[variant].episodes
+        trains += episodes(n - max(1, round(0.1 * n)), tags, prefix=variant or "e")  # the others validate
+    recipe = load_recipe(name, task, preset=preset)[1]
+    for source, chosen in choose(recipe, trains, where="data").items():
+        assert len(chosen) >= (recipe.source[source].count or 1)
 
 
 def test_a_recipe_that_is_not_there_names_those_there_are() -> None:

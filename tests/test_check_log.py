@@ -102,15 +102,6 @@ def test_idle_ends_are_a_note_with_how_much_could_be_trimmed(tmp_path: Path) -> 
     assert float(idle.evidence["idle_end_s"]) == pytest.approx(4.0, abs=0.15)
 
 
-def test_a_copy_under_another_name_is_found(tmp_path: Path) -> None:
-    write_faulty(tmp_path / "a.mcap", seed=1)
-    write_faulty(tmp_path / "b.mcap", seed=2)
-    (tmp_path / "c.mcap").write_bytes((tmp_path / "a.mcap").read_bytes())
-    found = [f for f in findings_of(tmp_path) if f.kind == "near-duplicate"]
-    assert [(Path(str(f.place.source)).name, f.severity) for f in found] == [("a.mcap", "warning")]
-    assert "c.mcap" in found[0].what
-
-
 def test_logs_of_different_rates_are_not_fitted_together(tmp_path: Path) -> None:
     """A step late is 50 ms in one and 100 ms in the other: one fit of both would have a remedy that is right for neither."""
     fast = write_faulty(tmp_path / "fast.mcap", seed=1, action_late=1, duration_s=15)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from tests.json_log import image, joints, write_json_log
 from tests.synthetic import write_zarr
 from tests.test_cli import ZARR_TASK
 from vilp_data import history
@@ -94,3 +95,40 @@ def test_several_patterns_add_up(work: Path) -> None:
     assert task.tags_of("demo2.zarr") == {"goal": "here", "object": "T"}
     assert task.tags_of("demo1.zarr") == {"goal": "here"}
     assert "tags" not in parse_task(ZARR_TASK, where="test").model_dump()
+
+
+COPIES = """
+name = "leg"
+rate_hz = 10
+views.front = { topic = "/camera/front/image", height = 48, width = 64 }
+low_dim.leg = { topic = "/joint_states" }
+tags."a.mcap" = { who = "anna", day = "monday" }
+tags."b.mcap" = { who = "ben" }
+"""
+
+
+@pytest.mark.parametrize("cuts", ["", "episodes = { by = 'gap', gap_s = 1.0 }\n"])
+def test_a_copy_of_which_something_else_is_said_overwrites_no_tag_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cuts: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "task.toml").write_text(COPIES + cuts)
+    said = [image(k / 10, index=k) for k in range(12)] + [joints(k / 10, ["hip"], [k]) for k in range(12)]
+    for name in ("a.mcap", "b.mcap"):
+        write_json_log(tmp_path / name, said)
+
+    def stored() -> list[dict[str, str]]:
+        return [{tag: value for tag, value in one.items() if tag in ("who", "day")} for one in tags()]
+
+    ingested("a.mcap")
+    assert stored() == [{"who": "anna", "day": "monday"}]
+    told = ingested("b.mcap")
+    assert stored() == [{"who": "anna", "day": "monday"}]
+    assert "day = monday (there nothing), who = anna (there ben); `vilp-data relabel" in told
+    assert "told otherwise" not in told
+    together = ingested("a.mcap", "b.mcap")
+    assert stored() == [{"who": "anna", "day": "monday"}]
+    assert "taken once, with the labels of that log: day = monday (there nothing), who = anna (there ben)" in together
+    (tmp_path / "task.toml").write_text((COPIES + cuts).replace("anna", "eve"))
+    ingested("a.mcap")  # its own log may say something else
+    assert stored() == [{"who": "eve", "day": "monday"}]

@@ -22,6 +22,7 @@ import pytest
 from mcap.writer import Writer
 from rerun.chunk import Chunk, RrdReader
 
+from tests.export_datasets import blind_dataset
 from tests.lerobot_folders import write_v21
 from tests.real_data import real_data
 from tests.synthetic import (
@@ -41,6 +42,7 @@ from tests.video_packets import GROUP, encode, number_of, numbered_frames
 from vilp_data import shards, viewer
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import LogError, StoreError, UsageError
+from vilp_data.ingest import ingest_logs
 from vilp_data.keys import FORMAT_VERSION
 from vilp_data.latents import latents_path
 from vilp_data.plots import panel_rank
@@ -132,6 +134,29 @@ def column(rrd: Path, entity: str, name: str) -> list[object]:
             times = batch.column(viewer_canvas.TIMELINE).cast("int64").to_pylist()
             rows += zip(times, batch.column(name).to_pylist(), strict=True)
     return [value for _, value in sorted(rows, key=lambda row: row[0])]
+
+
+def series_names(rrd: Path, entity: str) -> list[str]:
+    """The names of the series that are drawn at an entity."""
+    for chunk in RrdReader(rrd).stream():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if chunk.entity_path == f"/{entity}" and chunk.is_static and name.endswith(":names"):
+                return [str(series) for series in batch.column(name).to_pylist()[0]]
+    return []
+
+
+def rows_of_panels(rrd: Path) -> list[int]:
+    """How many panels each row of the layout has, from the top."""
+    reader = RrdReader(rrd)
+    [blueprint] = reader.blueprints()
+    containers: dict[str, list[str]] = {}
+    for chunk in reader.stream(store=blueprint):
+        batch = chunk.to_record_batch()
+        if "ContainerBlueprint:contents" in batch.schema.names:
+            containers[chunk.entity_path.lstrip("/")] = batch.column("ContainerBlueprint:contents").to_pylist()[0]
+    [rows] = [inside for inside in containers.values() if containers.keys() >= set(inside)]
+    return [len(containers[row]) for row in rows]
 
 
 def encoded_frames(rrd: Path, entity: str) -> list[U8]:
@@ -273,6 +298,50 @@ def test_stale_latents_are_left_out_and_said(tmp_path: Path) -> None:
     assert "front: no reconstruction" in drawn.notes[0]
     assert "side/reconstructed" in entities(tmp_path / "a.rrd")
     assert "front/reconstructed" not in entities(tmp_path / "a.rrd")
+
+
+def times_of(rrd: Path, entity: str) -> list[int]:
+    """The times of what is drawn at an entity, nanoseconds of its time line."""
+    columns = [chunk.to_record_batch().column(viewer_canvas.TIMELINE) for chunk in chunks_of(rrd, entity)]
+    return sorted(time for column in columns for time in column.cast("int64").to_pylist())
+
+
+def test_a_demonstration_deep_in_a_table_begins_at_zero(tmp_path: Path) -> None:
+    log = write_zarr(tmp_path / "many.zarr", episode_lengths=(12, 9, 5)).path
+    drawn = viewer.draw_log(log, tmp_path / "a.rrd", episode="episode_001")
+    tenths = [k * 10**8 for k in range(9)]
+    assert times_of(drawn.rrd, "img") == tenths
+    assert times_of(drawn.rrd, "action") == tenths
+    assert drawn.middle == {"duration": np.timedelta64(450, "ms")}
+    store = ingested(tmp_path, log)
+    second = store.index()[1].id
+    assert times_of(viewer.draw_episode(store, second, tmp_path / "b.rrd").rrd, "action/target") == tenths
+
+
+def ingested(tmp_path: Path, log: Path) -> EpisodeStore:
+    ingest_logs([log], tmp_path / "data", zarr_task_spec(), workers=1)
+    return EpisodeStore(tmp_path / "data")
+
+
+def test_a_wall_clock_stays_one(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "a.mcap")
+    drawn = viewer.draw_log(log.path, tmp_path / "a.rrd")
+    assert times_of(drawn.rrd, "joint_states/position")[0] // 10**9 == START_NS // 10**9
+    assert "timestamp" in drawn.middle
+
+
+def test_without_a_camera_the_plots_have_all_the_room(tmp_path: Path) -> None:
+    blind_dataset(tmp_path)
+    store = EpisodeStore(tmp_path)
+    assert rows_of_panels(viewer.draw_episode(store, store.index()[0].id, tmp_path / "a.rrd").rrd) == [3]
+    seeing, _ = small_store(tmp_path / "seeing")
+    assert rows_of_panels(viewer.draw_episode(seeing, EPISODE, tmp_path / "b.rrd").rrd) == [2, 3]
+
+
+def test_columns_of_a_table_are_plotted_under_its_names(tmp_path: Path) -> None:
+    folder = write_v21(tmp_path / "robot", images="image")
+    viewer.draw_log(folder.path, tmp_path / "a.rrd")
+    assert series_names(tmp_path / "a.rrd", "observation.state") == ["one", "two"]
 
 
 # --- what cannot be read ----------------------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ from vilp_data.errors import AlignError, LogError, SpecError, nearest
 from vilp_data.held_messages import messages_before, static_messages
 from vilp_data.sources import IndexedLog
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.types import F32, F64, I64, Bool, Episode, LogEpisode, LogReader, outcome_of
+from vilp_data.types import F32, F64, I64, Bool, ColumnNames, Episode, LogEpisode, LogReader, outcome_of
+from vilp_data.vector_parts import Parts, stated_names
 from vilp_data.vector_tracks import FieldsTrack, Track, Tracks, VectorTracks, age_names, no_message, stamp_ns
 from vilp_data.video_start import packets_before
 from vilp_data.view_frames import Seen, Ticks, ViewFrames
@@ -92,6 +93,7 @@ def assemble_episode(
         tags=dict(demonstration.tags),
         outcome=outcome_of(demonstration.tags),
         findings=findings,
+        column_names=_column_names(spec, tracks, action),
     )
 
 
@@ -132,7 +134,7 @@ def collect(
     }
     for topic, view in views.items():
         view.warm_up(packets_before(log, topic, demonstration))
-    vectors = VectorTracks(spec, topics, demonstration)
+    vectors = VectorTracks(spec, topics, demonstration, {topic.name: topic.names for topic in log.topics()})
     _add_held(log, demonstration, spec, vectors, topics)
     for message in log.messages(topics, start_ns=demonstration.start_ns, end_ns=demonstration.end_ns):
         if (camera := views.get(message.topic)) is not None:
@@ -244,6 +246,22 @@ def _storable(values: F64) -> Bool:
 def _as_stored(values: F64) -> F32:
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
+
+
+def _column_names(spec: TaskSpec, tracks: Tracks, action: Collection[str]) -> ColumnNames:
+    """What the log calls the numbers of each part, where the task's own fields do not call them so already."""
+    named: dict[str, dict[str, list[str]]] = {"low_dim": {}, "action": {}}
+    for part in spec.low_dim:
+        named["low_dim"][part] = list(tracks[f"low_dim.{part}"].column_names)
+    for part in action:
+        source = spec.action[part].from_
+        named["action"][part] = named["low_dim"][source] if source else list(tracks[f"action.{part}"].column_names)
+    stated: dict[str, Parts] = {"low_dim": spec.low_dim, "action": spec.action}
+    more = {
+        vector: {part: names for part, names in parts.items() if names and names != stated_names(stated[vector][part])}
+        for vector, parts in named.items()
+    }
+    return {vector: parts for vector, parts in more.items() if parts}
 
 
 # --- what the user should know ------------------------------------------------------------------------------------------

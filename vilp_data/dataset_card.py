@@ -12,17 +12,18 @@ import cv2
 import numpy as np
 
 from vilp_data import shards
+from vilp_data.alike_findings import alike_findings
 from vilp_data.contact_sheet import captioned, grid, stacked, to_png
 from vilp_data.dataset_split import find_split
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, number_of
 from vilp_data.keys import digest
-from vilp_data.plots import vector_parts
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
 from vilp_data.split_lock import SplitLock
 from vilp_data.stats import ChannelStats
 from vilp_data.types import F32, U8
+from vilp_data.vector_parts import differing_parts, shared_names, vector_parts
 
 SHEET_EPISODES, SHEET_TIMES = 6, 6
 SHEET_WIDTH = 160
@@ -228,13 +229,18 @@ def _vectors(
         stats = _stats(store, training or list(entries), name)
         if stats is None:
             continue
-        columns = vector_parts(np.arange(len(stats.mean), dtype=np.float32)[None], parts)
+        names = shared_names((entry.column_names for entry in entries), name)
+        columns = vector_parts(np.arange(len(stats.mean), dtype=np.float32)[None], parts, names)
         for part, (labels, numbers) in columns.items():
             for label, number in zip(labels, numbers[0].astype(int).tolist(), strict=True):
                 values = [f"{array[number]:.6g}" for array in (stats.mean, stats.std, stats.min, stats.max)]
                 rows.append([f"`{name}[{number}]`", f"{part}.{label}".strip("."), _meaning(parts.get(part)), *values])
         if list(columns) == [""] and len(parts) > 1:
             untold.append(f"The task does not say how wide each part of {name} is; in order: {', '.join(parts)}.")
+    if differing := differing_parts(entry.column_names for entry in entries):
+        untold.append(
+            f"Logs name the numbers of {', '.join(differing)} differently: the columns may not mean the same."
+        )
     if not rows:
         yield "Images alone."
         return
@@ -311,16 +317,12 @@ def _findings(entries: Sequence[EpisodeEntry]) -> Iterator[str]:
         if masked
         else "No step is masked."
     )
-    alike: dict[str, list[tuple[str, str]]] = {}
-    for entry in entries:
-        for finding in entry.findings:
-            alike.setdefault(re.sub(r"\d+(\.\d+)?", "N", finding), []).append((entry.id, finding))
+    alike = alike_findings((entry.id, finding) for entry in entries for finding in entry.findings)
     if alike:
         yield ""
-    for group in sorted(alike.values(), key=lambda found: (-len(found), found[0]))[:MOST_FINDINGS]:
-        episode, finding = group[0]
-        others = f" (and the like in {len(group) - 1} more)" if len(group) > 1 else ""
-        yield f"- `{episode}`: {finding}{others}"
+    for one in alike[:MOST_FINDINGS]:
+        others = f" (and the like in {len(one.episodes) - 1} more)" if len(one.episodes) > 1 else ""
+        yield f"- `{one.episodes[0]}`: {one.sentence}{others}"
     if len(alike) > MOST_FINDINGS:
         yield f"- and {len(alike) - MOST_FINDINGS} other kinds"
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from vilp_data import keys
 from vilp_data.keys import FORMAT_VERSION
-from vilp_data.types import Outcome
+from vilp_data.types import ColumnNames, Outcome
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class EpisodeEntry:
     `n_steps`, `n_valid`, `n_frames`, `key` and `content_sha256` are those of what there is to read: of a trimmed episode, the part
     that was kept. `edits` is empty for an episode as its log gave it; else it says what was changed since, see `edits`. `cut` is empty
     unless the task cut it out of its log: {"start_ns", "end_ns", "topics"}, the messages that `source_sha256` is of; "held", where it was
-    made of others too, their SHA-256."""
+    made of others too, their SHA-256. `column_names` as in `types.Episode`."""
 
     id: str
     source: str
@@ -56,6 +56,7 @@ class EpisodeEntry:
     has_state: bool
     edits: Mapping[str, Any] = field(default_factory=dict)
     cut: Mapping[str, Any] = field(default_factory=dict)
+    column_names: ColumnNames = field(default_factory=dict)
 
     @property
     def is_trimmed(self) -> bool:
@@ -96,8 +97,8 @@ class EpisodeEntry:
         return sha256 if count == self.stored_frames(view) else f"{sha256}[{first}:{first + count}]"
 
 
-_JSON_FIELDS = ("ingest", "tags", "findings", "frames_sha256", "n_frames", "edits", "cut")
-_OFTEN_EMPTY = ("edits", "cut")
+_JSON_FIELDS = ("ingest", "tags", "findings", "frames_sha256", "n_frames", "edits", "cut", "column_names")
+_OFTEN_EMPTY = ("edits", "cut", "column_names")
 _TEXT_FIELDS = ("id", "source", "source_sha256", "source_episode", "key", "outcome", "content_sha256")
 INDEX_SCHEMA = pa.schema(
     [(name, pa.string()) for name in (*_TEXT_FIELDS, *_JSON_FIELDS)]
@@ -113,7 +114,7 @@ def free_id(name: str, taken: Collection[str], *hashes: str) -> str:
 
 
 def header_of(entry: EpisodeEntry) -> dict[str, str]:
-    """The header of the entry's steps file. An episode without edits says nothing of them, nor one that is no cut of being one."""
+    """The header of the entry's steps file. What is often empty is left out where it is: edits, the cut, names."""
     row: dict[str, Any] = {"format": FORMAT_VERSION, **entry.__dict__}
     row |= {"has_action": int(entry.has_action), "has_state": int(entry.has_state)}
     return {
@@ -136,6 +137,7 @@ def entry_of(row: Mapping[str, Any]) -> EpisodeEntry:
         **{name: row[name] for name in _TEXT_FIELDS},
         ingest=parsed["ingest"], tags=parsed["tags"], findings=tuple(parsed["findings"]),
         frames_sha256=parsed["frames_sha256"], n_frames=parsed["n_frames"], edits=parsed["edits"], cut=parsed["cut"],
+        column_names=parsed["column_names"],
         n_steps=int(row["n_steps"]), n_valid=int(row["n_valid"]), rate_hz=float(row["rate_hz"]),
         has_action=bool(int(row["has_action"])), has_state=bool(int(row["has_state"])),
     )  # fmt: skip

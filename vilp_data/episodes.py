@@ -184,6 +184,7 @@ class EpisodeStore:
             tags=entry.tags,
             outcome=entry.outcome,
             findings=entry.findings,
+            column_names=entry.column_names,
         )
 
     def read_frames(self, view: str, entry: EpisodeEntry) -> U8:
@@ -259,5 +260,6 @@ def describe(episode: Episode, origin: Origin) -> tuple[EpisodeEntry, dict[str, 
         tags=dict(episode.tags), findings=tuple(episode.findings), frames_sha256=frames_sha256,
         n_frames={view: len(frames) for view, frames in episode.frames.items()}, content_sha256="",
         has_action=episode.action is not None, has_state=episode.state is not None, cut=dict(origin.cut),
+        column_names=dict(episode.column_names),
     )  # fmt: skip
     return replace(entry, content_sha256=content_hash(entry, steps)), steps

@@ -33,6 +33,7 @@ from vilp_data.removed import read_removed, removed_bytes, removed_path
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import RATE_TOLERANCE, Episode
+from vilp_data.vector_parts import differing_parts
 from vilp_data.writer_lock import remove_leftovers, writer_lock
 
 EPISODES_PER_JOB = 8
@@ -133,7 +134,8 @@ def ingest_logs(
         _keep_removed(root, plan.removed, report, met, work)
         _adopt(store, met, report, spec, work)
         store.ensure_index()
-        report.notes += [*notes_on_others(plan, report.written), *_twins(store, report.written)]
+        stored = store.index() if report.written else []
+        report.notes += [*notes_on_others(plan, report.written), *_twins(stored, report.written), *_other_names(stored)]
         report.written.sort()
         report.failed.sort()
         report.replaced = sorted(plan.replaced.intersection(report.written))
@@ -208,14 +210,23 @@ def _adopt(store: EpisodeStore, met: _Met, report: IngestReport, spec: TaskSpec,
     report.restated.sort()
 
 
-def _twins(store: EpisodeStore, written: Sequence[str]) -> Iterator[str]:
+def _twins(stored: Sequence[EpisodeEntry], written: Sequence[str]) -> Iterator[str]:
     """A sentence about each episode stored now that shows the same as others."""
     alike: dict[str, list[str]] = {}
-    for entry in store.index() if written else ():
+    for entry in stored:
         alike.setdefault(entry.ingest_content, []).append(entry.id)
     for ids in alike.values():
         if len(ids) > 1 and not set(ids).isdisjoint(written):
             yield f"{some_of(ids, 5)}: show the same; each is kept, all on one side of the split"
+
+
+def _other_names(stored: Sequence[EpisodeEntry]) -> Iterator[str]:
+    """A sentence about each part whose columns do not mean the same in all episodes, as far as their logs tell."""
+    for part in differing_parts(entry.column_names for entry in stored):
+        yield (
+            f"{part}: logs name its numbers differently, so its columns may not mean the same; `names` in the task reads joints in one"
+            " order"
+        )
 
 
 def _write_spec(store: EpisodeStore, spec: TaskSpec, work: Recording) -> None:

@@ -31,7 +31,7 @@ from vilp_data.edits import Edits, edits_of, restated
 from vilp_data.episode_entry import free_id
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, some_of
-from vilp_data.ingest_sources import KnownCut, Source, Sources, held_of, read_sources
+from vilp_data.ingest_sources import KnownCut, Source, Sources, held_of, read_sources, tags_said_otherwise
 from vilp_data.keys import episode_key, first_difference
 from vilp_data.known_content import KnownContent, known_contents, written_anew
 from vilp_data.log_hashes import HashCache
@@ -203,13 +203,17 @@ def _is_fresh(store: EpisodeStore, entry: EpisodeEntry, source: Source, fields: 
 
 
 def told_today(entry: EpisodeEntry, source: Source, spec: TaskSpec) -> tuple[EpisodeEntry, list[str]]:
-    """The entry of a stored episode with what its log and the task say of it today; what that means, in words. The name of a cut's log
-    stays: of the same bytes under two names none is righter."""
+    """The entry of a stored episode with what its log and the task say of it today; what that means, in words. A log of another name that
+    holds the same changes nothing: of two that say otherwise none is righter, and which came last must not decide."""
     tags, name = dict(source.demonstration.tags), entry.source_episode
     if source.cut is not None:
         name = source.demonstration.name
         tags |= {LOG_TAG: entry.tags[LOG_TAG]} if LOG_TAG in entry.tags else {}
     today, notes = replace(restated(entry, tags), source_episode=name), []
+    if source.log.name != entry.source:
+        told = tags_said_otherwise(today.tags, entry.tags)
+        note = f"{source.log}: holds {entry.id} of {entry.source}, whose labels stay: {told}; `vilp-data relabel {entry.id}` changes them"
+        return entry, [note] * bool(told)
     if name != entry.source_episode:
         notes.append(f"{entry.id}: called {name} in {spec.episodes.by} now; the episode keeps its id")
     if today.outcome == "failure" != entry.outcome:

@@ -10,6 +10,7 @@ from typing import Any
 
 from vilp_data.cut_identity import Cut, cut_sha256
 from vilp_data.cut_log import cut_log
+from vilp_data.demonstrations import LOG_TAG
 from vilp_data.errors import DecodeError, LogError, SpecError, some_of
 from vilp_data.held_messages import held_sha256
 from vilp_data.keys import digest
@@ -147,7 +148,19 @@ def _about_copies(copies: Sequence[tuple[Source, Source]]) -> Iterator[str]:
         if len(pairs) > 1:
             logs = some_of(list(dict.fromkeys(str(source.log) for source, _ in pairs)), 3)
             what = f"{logs}: {len(pairs)} copies of what {log} holds"
-        yield f"{what}, {likeness}; taken once"
+        said = sorted({told for source, first in pairs if (told := _said_otherwise(source, first))})
+        yield f"{what}, {likeness}; taken once" + (f", with the labels of that log: {some_of(said, 3)}" if said else "")
+
+
+def _said_otherwise(copy: Source, first: Source) -> str:
+    return tags_said_otherwise(copy.demonstration.tags, first.demonstration.tags)
+
+
+def tags_said_otherwise(said: Mapping[str, str], kept: Mapping[str, str]) -> str:
+    """How the tags of a copy differ from those that are kept, in words; a cut's tag that names its log aside. Empty for no difference."""
+    differing = [tag for tag in sorted({*said, *kept} - {LOG_TAG}) if said.get(tag) != kept.get(tag)]
+    nothing = "nothing"
+    return ", ".join(f"{tag} = {kept.get(tag, nothing)} (there {said.get(tag, nothing)})" for tag in differing)
 
 
 def _named(source: Source) -> str:

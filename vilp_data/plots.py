@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from vilp_data.spec import ActionSpec, VectorSpec
-from vilp_data.types import F32, F64, U8
+from vilp_data.types import F64, U8
 
 COMMAND_WORDS = ("action", "command", "cmd", "target", "desired")
 STATE_WORDS = ("joint", "pose", "gripper", "state")
@@ -56,27 +55,3 @@ def frame_psnr(real: U8, rebuilt: U8) -> F64:
     squared = (real.astype(np.float32) - rebuilt) ** 2
     error = squared.mean(axis=(1, 2, 3), dtype=np.float64)
     return 10 * np.log10(255.0**2 / np.where(error > 0, error, np.nan))
-
-
-def vector_parts(values: F32, parts: Mapping[str, ActionSpec | VectorSpec]) -> dict[str, tuple[list[str], F32]]:
-    """Part -> (a label for each column, its columns [F, n]) of a stored vector [F, sum of n], parts in the spec's order.
-
-    One part called "" where the spec does not tell the widths: a part without fields takes whatever its messages hold."""
-    labels = {name: _part_labels(part) for name, part in parts.items()}
-    if sum(map(len, labels.values())) != values.shape[1]:
-        return {"": ([str(index) for index in range(values.shape[1])], values)} if values.shape[1] else {}
-    starts = np.cumsum([0, *map(len, labels.values())])
-    spans = zip(labels.items(), starts, strict=False)  # one start more than parts: the end
-    return {name: (columns, values[:, start : start + len(columns)]) for (name, columns), start in spans if columns}
-
-
-def _part_labels(part: ActionSpec | VectorSpec) -> list[str]:
-    """A label for each value of a part, as far as the spec tells: `x`, `y`, or the index within a slice."""
-    labels: list[str] = []
-    for path in part.fields:
-        start, colon, stop = path.rpartition("[")[2].rstrip("]").partition(":")
-        if colon:
-            labels += [str(index) for index in range(int(start), int(stop))]
-        else:
-            labels.append(path.rpartition(".")[2])
-    return list(part.names) if part.names and len(labels) <= 1 else labels

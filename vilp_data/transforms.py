@@ -73,6 +73,12 @@ def pick_columns(values: F64, fields: Sequence[str], *, where: str) -> F64:
     return values[:, [column for name in fields for column in COLUMNS[name]]] if fields else values
 
 
+def picked_names(fields: Sequence[str]) -> tuple[str, ...]:
+    """The names of the columns that `pick_columns` picks: `translation.x`, …"""
+    single = [name for name in COLUMNS if "." in name]
+    return tuple(single[column] for name in fields or ("translation", "rotation") for column in COLUMNS[name])
+
+
 def plain(frame: str) -> str:
     return frame.lstrip("/")
 

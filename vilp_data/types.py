@@ -6,11 +6,11 @@ N planned frames (n_plan_frames), c h w latent channels, height and width, B win
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,9 @@ RATE_TOLERANCE = 0.02
 
 Clock = Literal["header", "log", "publish"]
 Outcome = Literal["success", "failure", "unknown"]
+
+ColumnNames: TypeAlias = Mapping[str, Mapping[str, Sequence[str]]]
+"""Vector ("low_dim", "action") -> part -> the names of its numbers."""
 
 
 # --- logs -----------------------------------------------------------------------------------------------------------
@@ -60,12 +63,13 @@ def outcome_of(tags: Mapping[str, str]) -> Outcome:
 class TopicInfo:
     """One topic of a log. `schema` is the name the log uses (`foxglove.CompressedImage`, `array`), of ROS types always the form
     `sensor_msgs/msg/Image`; `encoding` is how its messages are written (`cdr`, `ros1`, `protobuf`, `json`, `array`);
-    `message_count` is None where the log has no index to tell."""
+    `message_count` is None where the log has no index to tell. `names`: of an array's numbers, where the log says them."""
 
     name: str
     schema: str
     encoding: str
     message_count: int | None
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +151,8 @@ class Episode:
     state         float64 [F,S] simulator state for replaying, never given to a model; or None
     valid         bool [F]: False where an observation or action is missing, stale or not finite
     age_s         topic -> float32 [F]: tick time minus the time of the message used; NaN where there was none
+    column_names  "low_dim", "action" -> part -> what its log calls each of its numbers, of the parts where that is more than
+                  the task says
     """
 
     id: str
@@ -162,6 +168,7 @@ class Episode:
     tags: Mapping[str, str]
     outcome: Outcome
     findings: tuple[str, ...] = ()
+    column_names: ColumnNames = field(default_factory=dict)
 
     @property
     def n_steps(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from vilp_data import align, decode, rotations
 from vilp_data.align import NEVER_NS, Latest
+from vilp_data.decode.column_names import column_names
 from vilp_data.decode.vectors import concerns, published_names, rotation_columns
 from vilp_data.errors import DecodeError, LogError, nearest
 from vilp_data.spec import ActionSpec, TaskSpec, TopicSpec, VectorSpec
 from vilp_data.transform_tree import TransformTrack, TransformTree
-from vilp_data.transforms import STATIC, Link, links_of, pick_columns
+from vilp_data.transforms import STATIC, Link, links_of, pick_columns, picked_names
 from vilp_data.types import F64, I64, LogEpisode, Message
 
 ROWS_PACKED = 4096
@@ -25,12 +26,14 @@ VectorTable: TypeAlias = VectorSpec | ActionSpec
 
 class Track(Protocol):
     """One part's vectors in order of its topic's clock. `stamps_ns`: when something came, int64 [M] ascending; `held_s`: how long
-    before the demonstration the first message came that is not of it, 0 where there is none such."""
+    before the demonstration the first message came that is not of it, 0 where there is none such; `column_names`: of its numbers."""
 
     @property
     def held_s(self) -> float: ...
     @property
     def stamps_ns(self) -> I64: ...
+    @property
+    def column_names(self) -> tuple[str, ...]: ...
 
     def known_ns(self) -> I64:
         """Those of `stamps_ns` that are of the demonstration itself, and at which every number is known."""
@@ -98,7 +101,14 @@ class VectorTracks:
     """Give it every message of the `static_topics` that the log has (`add_static`), and every one of `topics`, those that came before
     the demonstration first (`add`); once more, where `read_again` says so; then ask for the `tracks`."""
 
-    def __init__(self, spec: TaskSpec, topics: Collection[str], demonstration: LogEpisode) -> None:
+    def __init__(
+        self,
+        spec: TaskSpec,
+        topics: Collection[str],
+        demonstration: LogEpisode,
+        topic_names: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        """`topic_names`: topic -> what its log calls the numbers of its arrays."""
         tables = {part: table for part, table in vector_tables(spec).items() if table.topic in topics}
         self._trees = {
             topic: _TransformsReader(topic, [table for table in tables.values() if table.topic == topic], demonstration)
@@ -113,7 +123,7 @@ class VectorTracks:
             if topic in self._trees:
                 self._parts[part] = _PartOfTree(self._trees[topic], table)
             else:
-                reader = self._parts[part] = _FieldsReader(table, demonstration)
+                reader = self._parts[part] = _FieldsReader(table, demonstration, (topic_names or {}).get(topic, ()))
                 self._readers.setdefault(topic, []).append(reader)
 
     @property
@@ -143,8 +153,9 @@ class VectorTracks:
 class _FieldsReader:
     """The rows of a part that is read from the fields of messages."""
 
-    def __init__(self, table: VectorTable, demonstration: LogEpisode) -> None:
+    def __init__(self, table: VectorTable, demonstration: LogEpisode, topic_names: Sequence[str]) -> None:
         self._table, self._topic, self._start_ns = table, str(table.topic), demonstration.start_ns
+        self._topic_names, self._column_names = topic_names, tuple[str, ...]()
         self._read = decode.compile_fields(table.fields, table.names)
         self._stamps, self._rows = array("q"), _Rows(self._topic)
         self._before = array("q")  # log times of the rows that came before the demonstration: the first ones
@@ -161,6 +172,8 @@ class _FieldsReader:
             self._before.append(message.log_time_ns)
         self._stamps.append(stamp_ns(message, self._table))
         self._rows.append(self._read(message))
+        if len(self._stamps) == 1:
+            self._column_names = column_names(message, self._table.fields, self._table.names, self._topic_names)
 
     def track(self, where: str) -> FieldsTrack:
         if not self._stamps:
@@ -174,7 +187,7 @@ class _FieldsReader:
             values[:, column : column + 4] = rotations.continuous(values[:, column : column + 4])
         held_s = (self._start_ns - self._before[-1]) / 1e9 if first < n_before else 0.0
         own_ns = int(stamps_ns[n_before:].min()) if n_before < len(stamps_ns) else None
-        return FieldsTrack(stamps_ns[first:][order], values, own_ns, held_s)
+        return FieldsTrack(stamps_ns[first:][order], values, own_ns, held_s, self._column_names)
 
     def _nothing(self, where: str) -> LogError:
         if self._others:
@@ -209,6 +222,7 @@ class FieldsTrack:
     values: F64
     own_ns: int | None = None
     held_s: float = 0.0
+    column_names: tuple[str, ...] = ()
 
     def known_ns(self) -> I64:
         if self.own_ns is None:
@@ -288,6 +302,10 @@ class ColumnsTrack:
     topic: str
     own_ns: int | None
     held_s: float = 0.0
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        return picked_names(self.fields)
 
     @property
     def stamps_ns(self) -> I64:

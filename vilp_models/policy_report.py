@@ -14,9 +14,9 @@ from torch import Tensor
 from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeStore
 from vilp_data.pairs import PairDataset, PairTensors
-from vilp_data.plots import vector_parts
 from vilp_data.spec import ActionSpec, TaskSpec
 from vilp_data.types import F32
+from vilp_data.vector_parts import vector_parts
 from vilp_models.imagined import Decoder, decode_frames
 from vilp_models.intervals import Estimate
 from vilp_models.plan_errors import Sums, score

@@ -46,12 +46,15 @@ class _Leaf:
     each: str | None = None
 
 
-def columns_of(body: Any) -> Columns | None:
-    """The columns of messages like this one; None where it holds no numbers, or too many to be a robot's state."""
+def columns_of(body: Any, names: Sequence[str] = ()) -> Columns | None:
+    """The columns of messages like this one; None where it holds no numbers, or too many to be a robot's state. `names`: of the
+    numbers of an array, where its log says them."""
     if isinstance(body, np.ndarray):
         if body.ndim > 1 or body.size > LARGEST_VECTOR or body.dtype.kind not in "fiub":
             return None
-        return Columns(tuple(f"[{i}]" for i in range(body.size)), lambda array: np.atleast_1d(array).tolist())
+        known = names if len(names) == body.size else [""] * body.size
+        labels = tuple(f"[{i}] {name}".strip() for i, name in enumerate(known))
+        return Columns(labels, lambda array: np.atleast_1d(array).tolist())
     leaves = list(_leaves(body, ()))
     names = tuple(name for leaf in leaves for name in _labels(leaf))
     if not names or len(names) > MAX_COLUMNS:

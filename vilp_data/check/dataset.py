@@ -24,10 +24,10 @@ from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import UsageError, VilpDataError
 from vilp_data.idle import moving_columns
 from vilp_data.locate import is_dataset
-from vilp_data.plots import vector_parts
 from vilp_data.spec import TaskSpec
 from vilp_data.split_lock import SplitLock
 from vilp_data.types import F32, F64, U8, Bool
+from vilp_data.vector_parts import vector_parts
 from vilp_data.windows import valid_runs
 
 INVALID_SHARE = 0.2
@@ -98,10 +98,12 @@ class _Look:
         at_s = (arrays["log_time_ns"] - arrays["log_time_ns"][0]) / 1e9
         valid = np.asarray(arrays["valid"])
         found = [*self._masked(entry, valid, at_s), *self._ingest_notes(entry)]
-        state = Series("low_dim", self._labels(arrays, "low_dim"), at_s[valid], _values(arrays, "low_dim", valid))
+        state = Series(
+            "low_dim", self._labels(entry, arrays, "low_dim"), at_s[valid], _values(arrays, "low_dim", valid)
+        )
         action = None
         if "action" in arrays:
-            labels = self._labels(arrays, "action")
+            labels = self._labels(entry, arrays, "action")
             action = Series("action", labels, at_s[valid], _values(arrays, "action", valid), command=True)
             found += series_findings(action)
         found += series_findings(state, busy=action)
@@ -143,11 +145,14 @@ class _Look:
             self.pictures[view].append((f"{entry.id}, {at_s[middle]:.1f} s", picture_of(frames[source_index[middle]])))
         return [sample_frame(frames[source_index[step]], float(at_s[step])) for step in steps]
 
-    def _labels(self, arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str) -> list[str]:
-        parts = vector_parts(arrays[vector], self.spec.low_dim if vector == "low_dim" else self.spec.action)
+    def _labels(
+        self, entry: EpisodeEntry, arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str
+    ) -> list[str]:
+        parts = self.spec.low_dim if vector == "low_dim" else self.spec.action
+        known = vector_parts(arrays[vector], parts, entry.column_names.get(vector, {}))
         return [
             f"{part}.{label}" if part else f"{vector}[{label}]"
-            for part, (labels, _) in parts.items()
+            for part, (labels, _) in known.items()
             for label in labels
         ]
 

@@ -15,8 +15,8 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Worst first. An error: data that cannot be read, or that would train something wrong. A warning: data that ingest will mask, or that
 deserves a look. A note: nothing wrong, worth knowing."""
 
-UNREAD = ("unreadable", "damaged")
-"""Kinds that say only that something cannot be read."""
+TOLD_APART = ("unreadable", "damaged", "copies")
+"""Kinds that say only that something cannot be read, or is there several times: what, or why, is in the sentence."""
 
 Evidence = Mapping[str, float | int | str]
 
@@ -85,11 +85,11 @@ def worst_first(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def grouped(findings: Iterable[Finding]) -> list[Group]:
-    """Worst first; findings of one kind and severity become one group, at the place of its first. What keeps a log from being read has
-    many causes, and each is a group."""
+    """Worst first; findings of one kind and severity become one group, at the place of its first. Of those TOLD_APART every
+    sentence is a group."""
     groups: dict[tuple[Severity, str, str], list[Finding]] = {}
     for finding in worst_first(findings):
-        cause = finding.what if finding.kind in UNREAD else ""
+        cause = finding.what if finding.kind in TOLD_APART else ""
         groups.setdefault((finding.severity, finding.kind, cause), []).append(finding)
     return [Group(tuple(members)) for members in groups.values()]
 

@@ -14,6 +14,7 @@ from typing import Literal
 
 from vilp_data.check.action import action_findings
 from vilp_data.check.action_fit import fit_action
+from vilp_data.check.copies import copies
 from vilp_data.check.dataset import check_dataset
 from vilp_data.check.findings import Finding, Place, worst_first
 from vilp_data.check.log import check_log
@@ -23,6 +24,7 @@ from vilp_data.engine import map_unordered
 from vilp_data.errors import VilpDataError
 from vilp_data.locate import is_dataset
 from vilp_data.log_files import find_logs
+from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec
 
 BETWEEN = "\x1f"  # between a source and a demonstration in a name: in no path
@@ -71,7 +73,7 @@ def check_sources(
                 progress(len(results), len(todo))
     checked = tuple(results[path] for path in todo)
     fits, found = _actions(checked)
-    return CheckReport(checked, (*found, *_look_alike(checked)), tuple(fits))
+    return CheckReport(checked, (*copies(checked, _sha256), *found, *_look_alike(checked)), tuple(fits))
 
 
 def _todo(paths: Sequence[Path]) -> Iterator[Path]:
@@ -125,6 +127,15 @@ def _actions(checked: Sequence[Checked]) -> tuple[list[Fit], list[Finding]]:
     return fits, findings
 
 
+def _sha256(checked: Checked) -> str:
+    """Of a log's bytes; of one that is gone meanwhile its path, which is like no other's."""
+    try:
+        with open_log(Path(checked.source)) as log:
+            return log.sha256()
+    except (VilpDataError, OSError):
+        return checked.source
+
+
 def _look_alike(checked: Sequence[Checked]) -> Iterator[Finding]:
     """Pairs of demonstrations whose first, middle and last pictures are nearly the same."""
     thumbnails = {
@@ -134,7 +145,10 @@ def _look_alike(checked: Sequence[Checked]) -> Iterator[Finding]:
         for name, small in one.thumbnails.items()
     }
     several = {one.source: len(one.thumbnails) > 1 for one in checked}
+    imprints = {f"{one.source}{BETWEEN}{name}": imprint for one in checked for name, imprint in one.imprints.items()}
     for pair in near_duplicates(thumbnails):
+        if imprints.get(pair.first, pair.first) == imprints.get(pair.second, pair.second):
+            continue  # not nearly: `copies` has said so
         (source, _, episode), (other, _, twin) = pair.first.partition(BETWEEN), pair.second.partition(BETWEEN)
         named = twin if other == source else f"{other}, {twin}" if several[other] else other
         yield Finding(

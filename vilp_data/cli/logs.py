@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vilp_data.alike_findings import alike_findings
 from vilp_data.cli.cuts import cuts_as_data, print_cuts
 from vilp_data.cli.options import (
     JsonOption,
@@ -257,9 +258,12 @@ def _say_ingested(root: Path, report: IngestReport, *, revives: bool, tagged: Se
         print(f"  an earlier ingest here was taken back; its history goes on: `vilp-data log {shlex.quote(str(root))}`")
     for note in report.notes:
         print(f"  {note}")
-    for episode, findings in sorted(report.findings.items()):
-        for finding in findings:
-            print(f"  {episode}: {finding}")
+    said = [(episode, finding) for episode, findings in sorted(report.findings.items()) for finding in findings]
+    for one in alike_findings(said):
+        others = (
+            f" (the like of {some_of(one.episodes[1:], FULL_FAILURES)}; --json has all)" if one.episodes[1:] else ""
+        )
+        print(f"  {one.episodes[0]}: {one.sentence}{others}")
 
 
 def _failures(failed: list[tuple[str, str]]) -> list[str]:

@@ -58,7 +58,7 @@ def follow(message: Message, path: str) -> Any:
     if steps and steps[0] == Member(WHOLE) and WHOLE not in member_names(value):
         steps = steps[1:]
     if steps and not isinstance(steps[0], Member) and not isinstance(value, np.ndarray):
-        value = _bare_array(message)
+        value = bare_array(message)
     for step in steps:
         if isinstance(step, Member):
             try:
@@ -84,7 +84,7 @@ def _no_member(message: Message, path: str, name: str, value: Any) -> DecodeErro
     return cannot_decode(message, f"field {path!r}: no {name!r}", None, remedy)
 
 
-def _bare_array(message: Message) -> Any:
+def bare_array(message: Message) -> Any:
     """What "[0:2]" indexes in a message that is no array: the only field that its schema's vector is made of, as of the std_msgs
     arrays; else the message itself, which has no items."""
     fields = usual_fields(message.schema) or ()

@@ -34,13 +34,14 @@ def as_numbers(value: Any) -> F64 | None:
     return array.astype(np.float64) if array.dtype.kind in "fiub" else None
 
 
-def numeric_series(message: Message) -> Series:
+def numeric_series(message: Message, names: Sequence[str] = ()) -> Series:
     """Every number in a message, grouped into what belongs in one plot. Header stamps and text are left out.
 
     An array of at most LARGEST_VECTOR values is a group, its series named by the message's parallel `name` list if that has the
     same length, else by index. Lists of messages (foxglove.JointStates, transforms) name their items by their own name."""
     series: Series = {}
-    for path, value in _leaves(message.body, ()):
+    body = message.body
+    for path, value in _list_leaves(body, (), names) if isinstance(body, np.ndarray) else _leaves(body, ()):
         group, name = ".".join(path[:-1]), path[-1]
         series.setdefault(group, {})[name] = value
     return series
@@ -59,7 +60,7 @@ def _paths(value: Any, path: str, depth: int) -> Iterator[str]:
         return
     if isinstance(value, bool | int | float | np.number | np.bool_):
         yield path
-    elif isinstance(value, np.ndarray) or _is_list(value):
+    elif isinstance(value, np.ndarray) or is_list(value):
         if len(value) and (
             value.dtype.kind in "fiub" if isinstance(value, np.ndarray) else _numbers(value) is not None
         ):
@@ -82,7 +83,7 @@ def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
     if isinstance(value, bool | int | float | np.number | np.bool_):
         with suppress(OverflowError):  # JSON has whole numbers of any length
             yield path or ("value",), float(value)
-    elif isinstance(value, np.ndarray) or _is_list(value):
+    elif isinstance(value, np.ndarray) or is_list(value):
         yield from _list_leaves(value, path, ())
     else:
         fields = dict(set_members(value))
@@ -90,7 +91,7 @@ def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
         for name, inside in fields.items():
             if name in ABOUT:
                 continue
-            if isinstance(inside, np.ndarray) or _is_list(inside):
+            if isinstance(inside, np.ndarray) or is_list(inside):
                 yield from _list_leaves(inside, (*path, name), names)
             else:
                 yield from _leaves(inside, (*path, name))
@@ -101,7 +102,9 @@ def _list_leaves(values: Any, path: tuple[str, ...], names: Sequence[str]) -> It
         return
     numbers = _numbers(values)
     if numbers is not None:
-        labels = names if len(names) == len(numbers) else [str(index) for index in range(len(numbers))]
+        labels = (
+            names if len(set(names)) == len(names) == len(numbers) else [str(index) for index in range(len(numbers))]
+        )
         yield from (((*path, label), number) for label, number in zip(labels, numbers, strict=True))
         return
     for index, item in enumerate(values):
@@ -119,12 +122,12 @@ def _numbers(values: Any) -> list[float] | None:
     return array.tolist() if array is not None and array.ndim == 1 else None
 
 
-def _is_list(value: Any) -> bool:
+def is_list(value: Any) -> bool:
     return isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
 
 
 def _texts(value: Any) -> Sequence[str]:
-    return [str(text) for text in value] if value is not None and _is_list(value) else ()
+    return [str(text) for text in value] if value is not None and is_list(value) else ()
 
 
 def _item_name(item: Any) -> str | None:

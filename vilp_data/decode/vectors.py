@@ -39,7 +39,7 @@ def compile_fields(fields: tuple[str, ...], names: tuple[str, ...] = ()) -> Vect
     orders: dict[tuple[str, ...], list[int]] = {}  # by the names that a message lists
 
     def read(message: Message) -> F64:
-        chosen = fields or _default_fields(message)
+        chosen = fields or default_fields(message)
         parts = [_numbers(message, path, follow(message, path)) for path in chosen]
         if names:
             published = published_names(message)
@@ -56,7 +56,7 @@ def rotation_columns(message: Message, fields: Sequence[str] = ()) -> tuple[int,
     """Where in the vector of a message each quaternion begins: of a path that leads to a rotation or to a message with some in it (a
     pose, a list of poses), and of four paths in a row that are one's x, y, z and w."""
     found: list[int] = []
-    paths, size = fields or _default_fields(message), 0
+    paths, size = fields or default_fields(message), 0
     for place, path in enumerate(paths):
         value = follow(message, path)
         found += [size + column for column in _rotations_in(value)[0]]
@@ -90,7 +90,8 @@ def published_names(message: Message) -> tuple[str, ...]:
     return listed
 
 
-def _default_fields(message: Message) -> tuple[str, ...]:
+def default_fields(message: Message) -> tuple[str, ...]:
+    """The paths that are read where a task names none. DecodeError where a schema has no usual ones."""
     if isinstance(message.body, np.ndarray | np.generic):
         return ("",)
     fields = usual_fields(message.schema)

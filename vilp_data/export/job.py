@@ -13,8 +13,8 @@ import numpy as np
 from vilp_data.episodes import EpisodeStore
 from vilp_data.export.segments import Chosen, Rows, Segment, Shapes, read_segments
 from vilp_data.export.video import frame_rate
-from vilp_data.plots import vector_parts
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
+from vilp_data.vector_parts import shared_names, vector_parts
 
 Images = Literal["h264", "h264-420", "lossless", "png"]
 
@@ -58,11 +58,20 @@ class ExportJob:
 
     @cached_property
     def low_dim(self) -> tuple[Column, ...]:
-        return _columns(self.shapes.low_dim, self.spec.low_dim, "low_dim")
+        return self._columns(self.shapes.low_dim, self.spec.low_dim, "low_dim")
 
     @cached_property
     def action(self) -> tuple[Column, ...]:
-        return _columns(self.shapes.action or 0, self.spec.action, "action")
+        return self._columns(self.shapes.action or 0, self.spec.action, "action")
+
+    def _columns(self, width: int, parts: Mapping[str, ActionSpec | VectorSpec], vector: str) -> tuple[Column, ...]:
+        """The parts of a vector of `width` numbers, in order; one part, called as the vector is, where nothing tells their widths."""
+        names = shared_names((segment.entry.column_names for segment in self.chosen.segments), vector)
+        columns, first = [], 0
+        for name, (labels, _) in vector_parts(np.empty((0, width), np.float32), parts, names).items():
+            columns.append(Column(name or (next(iter(parts)) if len(parts) == 1 else vector), tuple(labels), first))
+            first += len(labels)
+        return tuple(columns)
 
     def read(self) -> Iterator[tuple[Segment, Rows]]:
         """Every segment with its rows, in the order of the export."""
@@ -87,15 +96,6 @@ class ExportJob:
     def raw_bytes(self) -> int:
         """The same of all rows."""
         return sum(self.segment_bytes(segment) for segment in self.chosen.segments)
-
-
-def _columns(width: int, parts: Mapping[str, ActionSpec | VectorSpec], whole: str) -> tuple[Column, ...]:
-    """The parts of a vector of `width` numbers, in order; one part called `whole` where the spec does not tell their widths."""
-    columns, first = [], 0
-    for name, (labels, _) in vector_parts(np.empty((0, width), np.float32), parts).items():
-        columns.append(Column(name or (next(iter(parts)) if len(parts) == 1 else whole), tuple(labels), first))
-        first += len(labels)
-    return tuple(columns)
 
 
 @dataclass

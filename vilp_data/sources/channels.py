@@ -4,7 +4,7 @@ A channel is what a recorder wrote of one publisher: topic, encoding, schema. Se
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import NamedTuple
@@ -109,3 +109,35 @@ class Channels:
                 self._shared[key] = decoder_for(channel.encoding, channel.schema, where=where, distro=self._distro)
             self._decoders[channel_id] = self._shared[key]
         return self._decoders[channel_id]
+
+
+class SerialisedLog:
+    """What a `LogReader` is made of whose `raw_messages` are the serialised ones of `_channels`."""
+
+    _channels: Channels
+
+    def raw_messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """The messages that `messages` gives, still serialised; an unreadable topic is refused before the first of any."""
+        raise NotImplementedError
+
+    def messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """As `LogReader.messages`. After a MessageError the iterator can be asked for the next message."""
+        # `map` goes on after an error of `decoded`, which a generator would not.
+        return map(self.decoded, self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
+
+    def by_topic(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, RawMessage]]:
+        """The messages that `raw_messages` gives, each with its topic."""
+        return ((self.topic_of(raw), raw) for raw in self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
+
+    def topic_of(self, raw: RawMessage) -> str:
+        return self._channels.topic_of(raw)
+
+    def decoded(self, raw: RawMessage) -> Message:
+        """The message of some bytes; MessageError where they do not fit its schema."""
+        return self._channels.decoded(raw)

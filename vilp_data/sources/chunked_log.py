@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 import numpy as np
 
 from vilp_data.errors import LogError
-from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage
+from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage, SerialisedLog
 from vilp_data.sources.rosbag2_metadata import missing_from_file
 from vilp_data.types import EPISODE_RECORD, I64, LogEpisode, Message, TopicInfo
 
@@ -69,7 +69,7 @@ class ChunkedFile(Protocol):
 File = TypeVar("File", bound=ChunkedFile)
 
 
-class ChunkedLog(Generic[File]):
+class ChunkedLog(SerialisedLog, Generic[File]):
     """A `LogReader` over one open file, which it closes. The file is one episode."""
 
     def __init__(self, path: Path, file: File, channels: Mapping[int, Channel]) -> None:
@@ -101,13 +101,6 @@ class ChunkedLog(Generic[File]):
         counts = self._file.counts
         return missing_from_file(self.path, None if counts is None else sum(counts.values()))
 
-    def messages(
-        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        """As `LogReader.messages`. After a MessageError the iterator can be asked for the next message."""
-        # `map` goes on after an error of `decoded`, which a generator would not.
-        return map(self.decoded, self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
-
     def raw_messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
@@ -115,19 +108,6 @@ class ChunkedLog(Generic[File]):
         channel_ids = self._channels.ids_of(topics)
         self._channels.require_decoders(channel_ids)
         return self.in_order(channel_ids, start_ns or 0, END_OF_TIME_NS if end_ns is None else end_ns)
-
-    def topic_of(self, raw: RawMessage) -> str:
-        return self._channels.topic_of(raw)
-
-    def by_topic(
-        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[tuple[str, RawMessage]]:
-        """The messages that `raw_messages` gives, each with its topic."""
-        return ((self.topic_of(raw), raw) for raw in self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
-
-    def decoded(self, raw: RawMessage) -> Message:
-        """The message of some bytes; MessageError where they do not fit its schema."""
-        return self._channels.decoded(raw)
 
     def in_order(self, channel_ids: Collection[int], start_ns: int, end_ns: int) -> Iterator[RawMessage]:
         """Messages of these channels with start_ns <= log time < end_ns, by log time, ties as they lie in the file.

@@ -20,7 +20,7 @@ from mcap.records import Schema
 
 from vilp_data import limits
 from vilp_data.errors import LogError, copy_or_salvage, reason, salvage_command
-from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage
+from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage, SerialisedLog
 from vilp_data.sources.folder_hash import file_sha256
 from vilp_data.sources.message_decoders import BEFORE_DEFINITIONS
 from vilp_data.sources.rosbag2_metadata import missing_from_file
@@ -38,7 +38,7 @@ OPTIONAL = {
 }
 
 
-class Db3Log:
+class Db3Log(SerialisedLog):
     """A `LogReader` over one file. LogError where it is no database, no bag, cut off, or was not closed by its recorder.
 
     Publish times are not recorded: they are the log times. Types that the file does not define are those of its ROS 2 release.
@@ -87,12 +87,6 @@ class Db3Log:
         """Where the file is a part of a bag whose metadata.yaml counts other than as many messages in it."""
         return missing_from_file(self.path, sum(count for _, count, _, _ in self._counted()))
 
-    def messages(
-        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        """As `LogReader.messages`. After a MessageError the iterator can be asked for the next message."""
-        return map(self.decoded, self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
-
     def raw_messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
@@ -107,19 +101,6 @@ class Db3Log:
             " AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
             (*ids, first, end),
         )
-
-    def topic_of(self, raw: RawMessage) -> str:
-        return self._channels.topic_of(raw)
-
-    def by_topic(
-        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[tuple[str, RawMessage]]:
-        """The messages that `raw_messages` gives, each with its topic."""
-        return ((self.topic_of(raw), raw) for raw in self.raw_messages(topics, start_ns=start_ns, end_ns=end_ns))
-
-    def decoded(self, raw: RawMessage) -> Message:
-        """The message of some bytes; MessageError where they do not fit its schema."""
-        return self._channels.decoded(raw)
 
     def message_times(self) -> tuple[dict[str, I64], bool]:
         """Topic -> log times [n] in file order; and whether they are all (else the first part)."""

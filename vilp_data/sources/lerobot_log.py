@@ -85,7 +85,8 @@ class LeRobotLog:
         for name, feature in sorted(self._meta.features.items()):
             count = sum(episode.n_rows for episode in self._meta.episodes if self._has(episode, name))
             encoding = "video" if feature.kind == "video" else "parquet"
-            found.append(TopicInfo(name, SCHEMAS[feature.kind], encoding, count))
+            names = feature.names if feature.kind == "numbers" else ()
+            found.append(TopicInfo(name, SCHEMAS[feature.kind], encoding, count, names))
         return found
 
     def metadata(self) -> dict[str, dict[str, str]]:

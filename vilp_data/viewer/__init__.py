@@ -8,20 +8,20 @@ Everything is drawn into an .rrd file first; a window, a browser page and a pict
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from vilp_data.decode import is_wall_clock
 from vilp_data.decode.numeric_fields import numeric_series
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import DecodeError, LogError, UsageError, VilpDataError, nearest, some_of
 from vilp_data.latents import BATCH, FrameEncoder, read_latents, stale_reason
-from vilp_data.plots import Plot, frame_psnr, panel_rank, vector_parts
+from vilp_data.plots import Plot, frame_psnr, panel_rank
 from vilp_data.sources import MessageError, open_log
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
-from vilp_data.types import F16, F32, I32, I64, U8, LogEpisode, LogReader, Message
+from vilp_data.types import F16, F32, I32, I64, U8, Episode, LogEpisode, LogReader, Message
+from vilp_data.vector_parts import vector_parts
 from vilp_data.viewer.canvas import Canvas, Drawn, Picture, entity_of, title_of, writing
 from vilp_data.viewer.images import LogImages
 from vilp_data.viewer.window import present
@@ -85,7 +85,7 @@ def draw_log(
     with open_log(log_path, array_rate_hz=array_rate_hz) as log:
         chosen, notes = _choose(log, episode)
         left_out = LeftOut()
-        with writing(rrd, wall_clock=is_wall_clock(chosen.start_ns)) as canvas:
+        with writing(rrd, start_ns=chosen.start_ns) as canvas:
             cameras, plots = _draw_messages(canvas, log, chosen, left_out, progress)
             if not cameras and not plots:
                 found = "; ".join(["no images and no numbers", *left_out.notes()])
@@ -96,7 +96,7 @@ def draw_log(
             canvas.plots(plot for panel in plots.values() for plot in panel.values())
             ranked = sorted(plots, key=lambda topic: (panel_rank(topic, commands), topic))
             pictures = [Picture(entity_of(topic), title_of(topic)) for topic in cameras]
-            canvas.layout([pictures] if pictures else [], [list(plots[topic].values()) for topic in ranked])
+            canvas.layout([pictures], [list(plots[topic].values()) for topic in ranked])
         middle = canvas.moment((chosen.start_ns + chosen.end_ns) // 2)
         return Drawn(rrd, canvas.id, middle, (*notes, *left_out.notes()))
 
@@ -127,12 +127,13 @@ def _draw_messages(
     """(image topics, topic -> group -> plot) of one demonstration; images go to the file as they come."""
     cameras: dict[str, None] = {}
     plots: dict[str, dict[str, Plot]] = {}
+    names = {topic.name: topic.names for topic in log.topics()}
     images = LogImages(canvas)
     for message in _readable_messages(log, chosen, left_out):
         if progress is not None:
             progress(1)
         if not images.shows(message):
-            _plot_message(plots.setdefault(message.topic, {}), message)
+            _plot_message(plots.setdefault(message.topic, {}), message, names[message.topic])
             continue
         try:
             images.draw(message)
@@ -165,8 +166,8 @@ def _readable_messages(log: LogReader, chosen: LogEpisode, left_out: LeftOut) ->
             left_out.message(str(error.where).rpartition(", topic ")[2], error)
 
 
-def _plot_message(panel: dict[str, Plot], message: Message) -> None:
-    for group, values in numeric_series(message).items():
+def _plot_message(panel: dict[str, Plot], message: Message, names: Sequence[str]) -> None:
+    for group, values in numeric_series(message, names).items():
         if group not in panel:
             panel[group] = Plot(title_of(message.topic, group), entity_of(message.topic, group))
         panel[group].add(message.log_time_ns, values)
@@ -185,7 +186,7 @@ def draw_episode(
     damage."""
     entry, episode, spec = store.entry(episode_id), store.read(episode_id), store.spec()
     notes: list[str] = []
-    with writing(rrd, wall_clock=is_wall_clock(int(episode.log_time_ns[0]))) as canvas:
+    with writing(rrd, start_ns=int(episode.log_time_ns[0])) as canvas:
         rows: list[list[Picture]] = []
         fidelity: list[Plot] = []
         for view, frames in episode.frames.items():
@@ -205,8 +206,8 @@ def draw_episode(
             rows[-1].append(Picture(f"{view}/error", f"{view}: error × {ERROR_GAIN}"))
         panels = [fidelity] if fidelity else []
         if episode.action is not None:
-            panels += _vector_plots("action", episode.action, spec.action, episode.log_time_ns)
-        panels += _vector_plots("low_dim", episode.low_dim, spec.low_dim, episode.log_time_ns)
+            panels += _vector_plots("action", episode, episode.action, spec.action)
+        panels += _vector_plots("low_dim", episode, episode.low_dim, spec.low_dim)
         canvas.plots(plot for panel in panels for plot in panel)
         # Without reconstructions all views share one row; with them each view has its own.
         canvas.layout(rows if fidelity else [[row[0] for row in rows]], panels)
@@ -236,11 +237,11 @@ def _draw_reconstruction(canvas: Canvas, view: str, real: U8, rebuilt: U8, times
 
 
 def _vector_plots(
-    kind: str, values: F32, parts: Mapping[str, ActionSpec | VectorSpec], log_time_ns: I64
+    kind: str, episode: Episode, values: F32, parts: Mapping[str, ActionSpec | VectorSpec]
 ) -> list[list[Plot]]:
     """One panel for each part of a stored vector, so that metres and radians keep their own scales."""
-    times = log_time_ns.tolist()
+    times = episode.log_time_ns.tolist()
     return [
         [Plot(title_of(kind, name), entity_of(kind, name), labels, times, columns.tolist())]
-        for name, (labels, columns) in vector_parts(values, parts).items()
+        for name, (labels, columns) in vector_parts(values, parts, episode.column_names.get(kind, {})).items()
     ]

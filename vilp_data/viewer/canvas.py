@@ -15,6 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vilp_data import shards
+from vilp_data.decode import is_wall_clock
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.plots import Plot
 from vilp_data.types import F64, I64, U8
@@ -62,24 +63,26 @@ class Drawn:
 class Canvas:
     """An .rrd file in the making. Times are nanoseconds; images are RGB, top row first.
 
-    Images beyond SPILL_BYTES wait in a file without a name in `folder`."""
+    On a wall clock times are shown as dates; any other is counted from `start_ns`. Images beyond SPILL_BYTES wait in a file without a
+    name in `folder`."""
 
-    def __init__(self, *, wall_clock: bool, folder: Path) -> None:
+    def __init__(self, *, start_ns: int, folder: Path) -> None:
         self.id = uuid.uuid4().hex
         self._recording = rr.RecordingStream(APPLICATION, recording_id=self.id, send_properties=False)
         # Into memory, not to a file: Rerun's own file sink may hang on a full disk.
         self._stream = self._recording.binary_stream()
-        self._wall_clock = wall_clock
+        self._wall_clock = is_wall_clock(start_ns)
+        self._zero_ns = 0 if self._wall_clock else start_ns
         self._held: dict[str, list[tuple[int, bytes, str]]] = {}
         self._held_bytes = 0
         self._sent_bytes = 0
         self._pieces = RrdPieces(folder)
 
     def moment(self, time_ns: int) -> Moment:
-        """How Rerun's calls are told a time: a date on a wall clock, else a duration since zero."""
+        """How Rerun's calls are told a time: a date on a wall clock, else how long after the start."""
         if self._wall_clock:
             return {"timestamp": np.datetime64(time_ns, "ns")}
-        return {"duration": np.timedelta64(time_ns, "ns")}
+        return {"duration": np.timedelta64(time_ns - self._zero_ns, "ns")}
 
     def encoded_image(self, entity: str, time_ns: int, data: bytes, media_type: str) -> None:
         """One image as a file's bytes, `image/jpeg` or `image/png`."""
@@ -113,14 +116,18 @@ class Canvas:
             self._recording.send_columns(plot.entity, indexes=[times], columns=columns)
 
     def layout(self, pictures: Sequence[Sequence[Picture]], panels: Sequence[list[Plot]]) -> None:
-        """Rows of pictures over one row of plots, a panel's plots behind tabs; nothing else takes room."""
+        """Rows of pictures, where there are any, over one row of plots, a panel's plots behind tabs; nothing else takes room."""
         last = [plot for panel in panels[MAX_PANELS - 1 :] for plot in panel]
         shown = [*panels[: MAX_PANELS - 1], *([last] if last else [])]
         axis = self._whole_time([time_ns for panel in panels for plot in panel for time_ns in plot.times_ns])
         columns = [_panel(panel, axis) for panel in shown]
-        rows = [rrb.Horizontal(*(rrb.Spatial2DView(origin=p.entity, name=p.title) for p in row)) for row in pictures]
-        rows += [rrb.Horizontal(*columns)] if columns else []
-        shares = [3.0] * len(pictures) + [2.0 if len(pictures) == 1 else 3.0] * (len(rows) - len(pictures))
+        rows = [
+            rrb.Horizontal(*(rrb.Spatial2DView(origin=p.entity, name=p.title) for p in row)) for row in pictures if row
+        ]
+        shares = [3.0] * len(rows)
+        if columns:
+            shares += [2.0 if len(rows) == 1 else 3.0]
+            rows += [rrb.Horizontal(*columns)]
         blueprint = rrb.Blueprint(
             rrb.Vertical(*rows, row_shares=shares),
             rrb.TopPanel(state="collapsed"),
@@ -169,25 +176,25 @@ class Canvas:
         """A time axis over all that was drawn, the same for all plots."""
         if not times_ns:
             return None
-        ends = [rrb.TimeRangeBoundary.absolute(nanos=time_ns) for time_ns in (min(times_ns), max(times_ns))]
+        ends = [rrb.TimeRangeBoundary.absolute(nanos=at - self._zero_ns) for at in (min(times_ns), max(times_ns))]
         return rrb.TimeAxis(view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
 
     def _index(self, times_ns: npt.NDArray[Any]) -> rr.TimeColumn:
         if self._wall_clock:
             return rr.TimeColumn(TIMELINE, timestamp=times_ns.astype("datetime64[ns]"))
-        return rr.TimeColumn(TIMELINE, duration=times_ns.astype("timedelta64[ns]"))
+        return rr.TimeColumn(TIMELINE, duration=(times_ns - self._zero_ns).astype("timedelta64[ns]"))
 
 
 @contextmanager
-def writing(rrd: Path, *, wall_clock: bool) -> Iterator[Canvas]:
-    """A canvas whose file appears under its name only once it is whole; on any error nothing is left behind.
+def writing(rrd: Path, *, start_ns: int) -> Iterator[Canvas]:
+    """A canvas, as `Canvas`, whose file appears under its name only once it is whole; on any error nothing is left behind.
 
     Raises UsageError where its folder is missing, StoreError where the file cannot be written."""
     if not rrd.parent.is_dir():
         raise UsageError("no such folder", where=rrd.parent, remedy="make it, or save somewhere else")
     if rrd.is_dir():
         raise StoreError("a folder is in the way", where=rrd, remedy="save under another name")
-    canvas = Canvas(wall_clock=wall_clock, folder=rrd.parent)
+    canvas = Canvas(start_ns=start_ns, folder=rrd.parent)
     try:
         yield canvas
         with shards.atomic_file(rrd) as file:
@@ -205,7 +212,7 @@ def draw_clip(
 ) -> Drawn:
     """Draw a clip that is no episode: for each view a row of named pictures, uint8 [n,H,W,3] at `times_ns` [n] since its start, and
     below a plot of each view's named PSNR in dB, float64 [n], where it is defined. Raises as `writing` does."""
-    with writing(rrd, wall_clock=False) as canvas:
+    with writing(rrd, start_ns=0) as canvas:
         pictures = []
         for view, panels in rows.items():
             for name, frames in panels.items():

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 
 from vilp_data.contact_sheet import ERROR_GAIN
-from vilp_data.decode import is_wall_clock
 from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeStore
 from vilp_data.generated_episode import KINDS, GeneratedEpisode, Kind, shown_frames
-from vilp_data.plots import Plot, vector_parts
+from vilp_data.plots import Plot
 from vilp_data.types import F32, F64, I32, I64, U8
+from vilp_data.vector_parts import vector_parts
 from vilp_data.viewer.canvas import Canvas, Drawn, Picture, entity_of, title_of, writing
 
 PANELS = ("real", *KINDS, "error")
@@ -40,14 +40,15 @@ def draw_generated(
     entry, spec = store.entry(generated.episode), store.spec()
     arrays = open_steps(store, entry)
     times: I64 = np.asarray(arrays["log_time_ns"])
-    with writing(rrd, wall_clock=is_wall_clock(int(times[0]))) as canvas:
+    with writing(rrd, start_ns=int(times[0])) as canvas:
         rows = [_draw_view(canvas, store, generated, view, times, progress) for view in generated.views]
         panels = [_measured("PSNR in dB", "psnr", generated, generated.psnr_db, times)]
         if generated.lpips:
             panels.append(_measured("LPIPS", "lpips", generated, generated.lpips, times))
         recorded = arrays.get("action")
-        parts = vector_parts(generated.action, spec.action)
-        truth = vector_parts(recorded, spec.action) if recorded is not None else {}
+        names = entry.column_names.get("action", {})
+        parts = vector_parts(generated.action, spec.action, names)
+        truth = vector_parts(recorded, spec.action, names) if recorded is not None else {}
         panels += [
             [_actions(name, labels, made, truth.get(name, (labels, None))[1], generated, times)]
             for name, (labels, made) in parts.items()

@@ -19,9 +19,9 @@ from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.generated_episode import KINDS, GeneratedEpisode, shown_frames
 from vilp_data.mp4 import enlarged, write_mp4
-from vilp_data.plots import vector_parts
 from vilp_data.spec import TaskSpec
 from vilp_data.types import F32, F64, U8, Bool
+from vilp_data.vector_parts import vector_parts
 from vilp_data.viewer.curves import Line, curve
 from vilp_data.viewer.generated_style import SCRIPT, STYLE
 
@@ -86,8 +86,9 @@ class _Episode:
 
     def action_parts(self) -> Iterator[tuple[str, F32, F32 | None]]:
         """(name, predicted [F], recorded [F] or None) of each value of the action."""
-        parts = vector_parts(self.generated.action, self.spec.action)
-        recorded = vector_parts(self.recorded, self.spec.action) if self.recorded is not None else {}
+        names = self.entry.column_names.get("action", {})
+        parts = vector_parts(self.generated.action, self.spec.action, names)
+        recorded = vector_parts(self.recorded, self.spec.action, names) if self.recorded is not None else {}
         for part, (labels, made) in parts.items():
             unit = self.spec.action[part].unit if part in self.spec.action else None
             for column, label in enumerate(labels):
