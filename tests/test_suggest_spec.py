@@ -24,6 +24,8 @@ from vilp_data.errors import LogError
 from vilp_data.ingest import ingest_logs
 from vilp_data.log_summary import format_summary, summarise
 from vilp_data.model_size import common_size, cut_share, model_size
+from vilp_data.recorder import EpisodeRecorder
+from vilp_data.sources import open_log
 from vilp_data.sources.mcap_log import McapLog
 from vilp_data.spec import TaskSpec, parse_task
 from vilp_data.suggest_spec import _part_names, suggest_spec
@@ -125,6 +127,18 @@ def test_topics_that_end_alike_are_named_by_what_tells_them_apart() -> None:
 def test_a_clock_is_no_command() -> None:
     assert role_of("/time_reference", [Message("/time_reference", "array", 0, 0, np.zeros(2))]).kind == "unused"
     assert role_of("/reference", [Message("/reference", "array", 0, 0, np.zeros(2))]).kind == "command"
+
+
+def test_what_a_simulator_says_of_its_world_is_not_what_a_policy_sees(tmp_path: Path) -> None:
+    """Logs of `record` and `render` carry it, as an array of a ROS type."""
+    with EpisodeRecorder(tmp_path / "run.mcap", metadata={}) as log:
+        for tick in range(20):
+            log.vector("/sim/state", tick * 100_000_000 + START_NS, np.arange(32.0))
+            log.vector("/arm/state", tick * 100_000_000 + START_NS, np.arange(7.0))
+    with open_log(tmp_path / "run.mcap") as written:
+        [simulated, measured] = [[*written.messages([topic])] for topic in ("/sim/state", "/arm/state")]
+    assert role_of("/sim/state", simulated).kind == "other"
+    assert role_of("/arm/state", measured).kind == "state"
 
 
 # --- choices ------------------------------------------------------------------------------------------------------------------------

@@ -203,7 +203,7 @@ def _kind(first: Message, words: set[str], known: bool, size: int) -> tuple[Kind
     many = f"{size} number{'s' if size > 1 else ''}"
     if named := sorted(words & COMMAND_WORDS):
         return "command", f'its name says "{named[0]}"; {many}'
-    if words & SIMULATOR_WORDS and first.schema == "array":
+    if _of_a_simulator(first.schema, words):
         return "other", f"{many}; a simulator's own state is nothing that a robot could see"
     if not known:
         return "other", f"{many} of a type of its own, {first.schema}"
@@ -211,6 +211,13 @@ def _kind(first: Message, words: set[str], known: bool, size: int) -> tuple[Kind
     if STATE_SCHEMAS.search(first.schema) and not plain and size > (1 if first.schema == "array" else 0):
         return "state", many if first.schema == "array" else f"{first.schema}, {many}"
     return "other", f"{first.schema}, {many}"
+
+
+def _of_a_simulator(schema: str, words: set[str]) -> bool:
+    """Whether an array holds a simulated world: "states" is enough where a table calls it that, but not of a robot's message."""
+    if schema == "array":
+        return bool(words & SIMULATOR_WORDS)
+    return schema.endswith("MultiArray") and bool(words & (SIMULATOR_WORDS - {"states"}))
 
 
 def _header_lag_s(messages: list[Message]) -> float | None:

@@ -18,10 +18,21 @@ pytest.importorskip("robosuite", reason="the simulators are not installed (make 
 
 from vilp_data.errors import UsageError  # noqa: E402
 from vilp_data.sims.arm_env import ArmEnv  # noqa: E402
+from vilp_data.sims.can import CanEnv  # noqa: E402
+from vilp_data.sims.can_expert import CanExpert  # noqa: E402
 from vilp_data.sims.hanoi import HanoiEnv  # noqa: E402
 from vilp_data.sims.hanoi_expert import HanoiExpert  # noqa: E402
+from vilp_data.sims.move_the_stack import MoveTheStackEnv  # noqa: E402
+from vilp_data.sims.move_the_stack_expert import MoveTheStackExpert  # noqa: E402
+from vilp_data.sims.nut_assembly import NutAssemblyEnv  # noqa: E402
+from vilp_data.sims.nut_assembly_expert import NutAssemblyExpert  # noqa: E402
 
-TASKS: dict[str, tuple[Any, Any, dict[str, Any]]] = {"hanoi": (HanoiEnv, HanoiExpert, {"n_discs": 1})}
+TASKS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "can": (CanEnv, CanExpert, {}),
+    "hanoi": (HanoiEnv, HanoiExpert, {"n_discs": 1}),
+    "move_the_stack": (MoveTheStackEnv, MoveTheStackExpert, {}),
+    "nut_assembly": (NutAssemblyEnv, NutAssemblyExpert, {}),
+}
 """Task -> its environment, its expert, and the options of an environment that is quick."""
 
 

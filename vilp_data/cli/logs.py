@@ -29,7 +29,7 @@ from vilp_data.errors import UsageError, number_of, some_of
 from vilp_data.locate import a_dataset, default_root, find_dataset, has_been_dataset, is_dataset, remember
 from vilp_data.log_files import find_logs, is_one_log
 from vilp_data.sources.rosbag2_metadata import is_bag_folder
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec, load_task, task_names
 
 if TYPE_CHECKING:
     from vilp_data.ingest import IngestReport
@@ -291,6 +291,6 @@ def _dataset_and_its_spec(given: Path | None) -> tuple[Path, TaskSpec]:
     except UsageError as error:
         raise UsageError(
             "which task do these logs belong to?",
-            remedy="--task NAME or --task FILE.toml (built-in: arrange_blocks, hanoi, pusht)",
+            remedy=f"--task NAME or --task FILE.toml (built-in: {', '.join(task_names())})",
         ) from error
     return root, EpisodeStore(root).spec()

@@ -28,7 +28,7 @@ DatasetArgument = Annotated[
     ),
 ]
 TaskOption = Annotated[
-    str, typer.Option(help="A built-in task (arrange_blocks, hanoi, pusht), or a path to a task TOML.")
+    str, typer.Option(help="A built-in task (hanoi, pusht, can, …: docs/tasks.md), or a path to a task TOML.")
 ]
 PresetOption = Annotated[
     str | None, typer.Option(help=f"Overrides from the task's [presets]: {', '.join(PRESETS)}.", show_default=False)

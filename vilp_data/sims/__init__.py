@@ -21,7 +21,10 @@ logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= l
 
 ENVIRONMENTS = {
     "vilp/ArrangeBlocks-v0": "vilp_data.sims.arrange_blocks:ArrangeBlocksEnv",
+    "vilp/Can-v0": "vilp_data.sims.can:CanEnv",
     "vilp/Hanoi-v0": "vilp_data.sims.hanoi:HanoiEnv",
+    "vilp/MoveTheStack-v0": "vilp_data.sims.move_the_stack:MoveTheStackEnv",
+    "vilp/NutAssembly-v0": "vilp_data.sims.nut_assembly:NutAssemblyEnv",
     "vilp/PushT-v0": "vilp_data.sims.pusht:PushTEnv",
 }
 

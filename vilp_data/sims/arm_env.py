@@ -218,10 +218,7 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
 
     def _image(self, view: str) -> Any:
         camera = self.scene.cameras[view]
-        image = self.scene.sim.render(
-            width=self.width, height=self.height, camera_name=camera if isinstance(camera, str) else view
-        )
-        return np.ascontiguousarray(image[::-1])  # OpenGL counts rows from the bottom
+        return self.scene.draw(camera if isinstance(camera, str) else view, self.height, self.width)
 
     def _proprioception(self) -> Proprioception:
         robot, data = self.scene.robots[0], self.scene.sim.data

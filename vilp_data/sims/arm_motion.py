@@ -1,4 +1,4 @@
-"""How scripted experts move an arm: closed-loop steps towards a place, the gripper pointing straight down.
+"""How scripted experts move an arm: closed-loop steps towards a place, the gripper pointing straight down unless told otherwise.
 
 An expert sees the true poses. It steers by what it sees at every step, so its actions are deltas towards the next waypoint.
 """
@@ -24,13 +24,16 @@ DOWN = np.array([0.0, 0.0, -1.0])
 class ArmMotion:
     """Moves the gripper of `scene`; each method gives actions float32 [7] of `ArmEnv`, to be stepped one at a time.
 
-    fingers_along   a horizontal direction, float64 [3] in the world: the fingers open along it, either way round. It may be set anew at
-                    any time; the hand turns there on its way.
+    fingers_along   a direction, float64 [3] in the world, of length 1: the fingers open along it, either way round
+    pointing        where they point, float64 [3] of length 1, square to the other: straight down unless it is set
+
+    Both may be set anew at any time; the hand turns there on its way.
     """
 
     def __init__(self, scene: ArmScene, fingers_along: F64) -> None:
         self.scene = scene
         self.fingers_along = fingers_along
+        self.pointing = DOWN
 
     def go(self, target: F64, gripper: float, *, tolerance: float, n_steps: int = WAYPOINT_STEPS) -> Iterator[F32]:
         """Towards a position of the grip site (world), within `tolerance` metres, in `n_steps` at most."""
@@ -54,12 +57,12 @@ class ArmMotion:
         return np.concatenate([step, turn, [gripper]]).astype(np.float32)
 
     def rotation_error(self) -> F64:
-        """Axis-angle, base frame, that turns the gripper straight down with its fingers opening as they should."""
+        """Axis-angle, base frame, that turns the gripper to where it should point, its fingers opening as they should."""
         now = self.scene.grip_rotation()
         along = self.fingers_along
         if along @ now[:, 0] < 0:  # the fingers are alike: take the nearer half turn
             along = -along
-        wanted = np.column_stack([along, np.cross(DOWN, along), DOWN])
+        wanted = np.column_stack([along, np.cross(self.pointing, along), self.pointing])
         return np.asarray(transforms.quat2axisangle(transforms.mat2quat(wanted @ now.T)), np.float64)
 
 

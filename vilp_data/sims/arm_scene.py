@@ -16,7 +16,7 @@ from robosuite.controllers import load_composite_controller_config
 from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
 
 from vilp_data.errors import UsageError
-from vilp_data.types import F64
+from vilp_data.types import F64, U8
 
 ROBOTS = ("Panda", "UR5e")
 CONTROL_RATE_HZ = 20
@@ -108,6 +108,23 @@ class ArmScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no types
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
 
+    def draw(self, camera: str, height: int, width: int) -> U8:
+        """What a camera of the model sees: uint8 [height,width,3] RGB, top row first."""
+        self._draw_here()
+        image = self.sim.render(width=width, height=height, camera_name=camera)
+        return np.ascontiguousarray(image[::-1])  # OpenGL counts rows from the bottom
+
+    def close(self) -> None:
+        self._draw_here()
+        super().close()
+
+    def _draw_here(self) -> None:
+        """OpenGL draws and frees in the context that is current, and robosuite makes none so: with two worlds in a process, one would draw
+        with what the other has loaded, and closing one would free the other's."""
+        context = self.sim._render_context_offscreen if self.sim is not None else None
+        if context is not None:
+            context.gl_ctx.make_current()
+
     def forget_controller_cache(self) -> None:
         """Make the controllers read the joints anew at the next step, after a state was set from outside."""
         for part in self.robots[0].part_controllers.values():
@@ -131,6 +148,9 @@ class ArmScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no types
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
+        # What the arm's spare freedom is pulled towards. robosuite takes the joints' first angles, which seeds draw and no state holds.
+        robot = self.robots[0]
+        robot.part_controllers["right"].initial_joint = np.array(robot.init_qpos)
         context = self.sim._render_context_offscreen
         if context is not None:
             context.vopt.sitegroup[:] = 0

@@ -61,8 +61,21 @@ RECORDABLE = {
     "vilp/ArrangeBlocks-v0": _Recordable(
         "vilp_data.sims.arrange_blocks_expert:ArrangeBlocksExpert", ("gymnasium", "pymunk"), ("pymunk",)
     ),
+    "vilp/Can-v0": _Recordable(
+        "vilp_data.sims.can_expert:CanExpert", ("gymnasium", "mujoco", "robosuite"), ("robosuite", "mujoco")
+    ),
     "vilp/Hanoi-v0": _Recordable(
         "vilp_data.sims.hanoi_expert:HanoiExpert", ("gymnasium", "mujoco", "robosuite"), ("robosuite", "mujoco")
+    ),
+    "vilp/MoveTheStack-v0": _Recordable(
+        "vilp_data.sims.move_the_stack_expert:MoveTheStackExpert",
+        ("gymnasium", "mujoco", "robosuite"),
+        ("robosuite", "mujoco"),
+    ),
+    "vilp/NutAssembly-v0": _Recordable(
+        "vilp_data.sims.nut_assembly_expert:NutAssemblyExpert",
+        ("gymnasium", "mujoco", "robosuite"),
+        ("robosuite", "mujoco"),
     ),
     "vilp/PushT-v0": _Recordable(
         "vilp_data.sims.pusht_expert:PushTExpert", ("gymnasium", "gym_pusht", "pymunk"), ("gym-pusht", "pymunk")
