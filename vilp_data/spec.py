@@ -202,11 +202,18 @@ class WindowSpec(Frozen):
 
 
 class SimSpec(Frozen):
-    """The simulator of this task: a gymnasium id, keyword arguments for it, and how many steps a policy may take in it."""
+    """The simulator of this task: a gymnasium id, keyword arguments for it, and how many steps a policy may take in it. `expert`
+    ("module:Class") is who `record` lets drive it, where it is none of ours."""
 
     env: str
     options: dict[str, Any] = {}
     max_steps: int = Field(default=300, gt=0)
+    expert: str | None = Field(default=None, pattern=r"^[\w.]+:\w+$")
+
+    @model_serializer(mode="wrap")
+    def _with_expert_if_stated(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without it where none is stated, as before there was any."""
+        return {name: value for name, value in plain(self).items() if name != "expert" or value}
 
 
 class VariantSpec(Frozen):

@@ -24,7 +24,7 @@ from typing import Any, Protocol
 from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import EpisodeRecorder
-from vilp_data.sims import ENVIRONMENTS, load_entry_point
+from vilp_data.sims import load_entry_point, register
 from vilp_data.sims.episode_log import START_NS, tick_writer
 from vilp_data.sims.finished_log import finished_tags
 from vilp_data.spec import SimSpec, TaskSpec
@@ -122,11 +122,10 @@ def record_task(
     Raises UsageError where the task has no scripted expert, the simulator is not installed, or a log in `out_dir` was made with
     other options; SpecError for a variant that it does not have.
     """
-    if spec.sim is None or spec.sim.env not in RECORDABLE:
+    if spec.sim is None or (spec.sim.expert is None and spec.sim.env not in RECORDABLE):
         env = "no [sim] table" if spec.sim is None else spec.sim.env
-        raise UsageError(
-            "there is no scripted expert for this task", where=spec.name, found=env, remedy=nearest(env, RECORDABLE)
-        )
+        remedy = f"{nearest(env, RECORDABLE)}, or name one of yours as `expert` of [sim] (docs/add_a_task.md)"
+        raise UsageError("there is no scripted expert for this task", where=spec.name, found=env, remedy=remedy)
     name = spec.name if variant is None else f"{spec.name}-{variant}"
     sim = spec.sim if variant is None else spec.simulated_as(variant)
     jobs = [
@@ -147,8 +146,13 @@ def record_task(
     return [done[job.seed] for job in jobs]
 
 
+def _recordable(sim: SimSpec) -> _Recordable:
+    """Of a simulator of someone else's nothing is known but that it needs gymnasium."""
+    return RECORDABLE[sim.env] if sim.expert is None else _Recordable(sim.expert, ("gymnasium",), ())
+
+
 def _require_for(sim: SimSpec) -> None:
-    packages = RECORDABLE[sim.env].packages
+    packages = _recordable(sim).packages
     if "robosuite" in packages:
         require_simulator(cameras=bool(sim.options.get("cameras", True)))
     else:
@@ -191,18 +195,40 @@ def _options_text(job: _Job) -> str:
     return json.dumps(dict(job.sim.options), sort_keys=True)
 
 
-def _record_one(job: _Job) -> RecordedEpisode:
-    """Runs in a worker process: the simulator is imported here."""
+def _make_env(sim: SimSpec) -> Any:
+    """The environment itself, without gymnasium's wrappers. UsageError where there is none of that id, or it does not take the options."""
+    register()
+    import gymnasium
+
     try:
-        env = load_entry_point(ENVIRONMENTS[job.sim.env])(**job.sim.options)
+        return gymnasium.make(sim.env, disable_env_checker=True, **sim.options).unwrapped
     except TypeError as error:
         remedy = "compare the options of [sim] and of its [record.variants] with the environment's"
         raise UsageError(
-            "the simulator does not take these options", where=job.sim.env, found=error, remedy=remedy
+            "the simulator does not take these options", where=sim.env, found=error, remedy=remedy
         ) from error
+    except (gymnasium.error.Error, ImportError) as error:
+        remedy = "`env` of [sim] is a gymnasium id; of a package of yours MODULE:ID, which must be on PYTHONPATH"
+        raise UsageError("the simulator cannot be made", where=sim.env, found=error, remedy=remedy) from error
+
+
+def _make_expert(sim: SimSpec, env: Any, seed: int) -> Expert:
+    entry_point = _recordable(sim).expert
+    try:
+        kind = load_entry_point(entry_point)
+    except (ImportError, AttributeError) as error:
+        remedy = "`expert` of [sim] is MODULE:CLASS, whose module must be on PYTHONPATH"
+        raise UsageError("the expert cannot be loaded", where=entry_point, found=error, remedy=remedy) from error
+    expert: Expert = kind(env, seed=seed)
+    return expert
+
+
+def _record_one(job: _Job) -> RecordedEpisode:
+    """Runs in a worker process: the simulator is imported here."""
+    env = _make_env(job.sim)
     try:
         observation, info = env.reset(seed=job.seed)
-        expert: Expert = load_entry_point(RECORDABLE[job.sim.env].expert)(env, seed=job.seed)
+        expert = _make_expert(job.sim, env, job.seed)
         write = tick_writer(job.spec, env)
         with EpisodeRecorder(job.path, metadata=_tags(job, env, expert), seed=job.seed) as log:
             tick, tick_ns = 0, round(1e9 / (job.spec.rate_hz or env.metadata["render_fps"]))
@@ -223,10 +249,10 @@ def _tags(job: _Job, env: Any, expert: Expert) -> dict[str, str]:
     return {
         "task": job.spec.name,
         "seed": str(job.seed),
-        **env.tags(),
+        **(env.tags() if hasattr(env, "tags") else {}),
         **expert.tags(),
         **({} if job.variant is None else {"variant": job.variant}),
         "policy": "scripted_expert",
         "options": _options_text(job),
-        **{f"{name}_version": version(name) for name in ("vilp", *RECORDABLE[job.sim.env].stated)},
+        **{f"{name}_version": version(name) for name in ("vilp", *_recordable(job.sim).stated)},
     }
