@@ -6,6 +6,7 @@ import random
 import sqlite3
 import struct
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -109,6 +110,22 @@ def write_db3(
     else:
         database.close()
     return sent
+
+
+def write_two_tables(path: Path, *, page: int = 512, topic_id: int = 1) -> tuple[list[Sent], dict[str, int]]:
+    """A bag of 120 messages and, before and between them, 180 rows of another table of the same shape; and the root of every
+    table. Rows of the other one are of topic `topic_id`."""
+    write_db3(path, n=0, page=page)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE thumbs(id INTEGER PRIMARY KEY, topic_id INTEGER, at INTEGER, data BLOB)")
+        sent = []
+        for k in range(180):
+            database.execute("INSERT INTO thumbs VALUES(?, ?, ?, ?)", (k + 1, topic_id, 1000 + k, b"small" * 20))
+            if k >= 60:
+                sent.append(Sent("/t0", 1000 + k, 1000 + k, 0, b"large%03d" % k * 100))
+                database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", sent[-1][1::3])
+        database.commit()
+        return sent, dict(database.execute("SELECT name, rootpage FROM sqlite_master WHERE type = 'table'").fetchall())
 
 
 def read_log(path: Path) -> list[Sent]:

@@ -21,10 +21,33 @@ low_dim.leg = { topic = "/joint_states" }
 
 def test_sentences_that_differ_in_their_numbers_are_one() -> None:
     found = [("a", "3 of 30 steps"), ("b", "no action"), ("c", "12.5 of 40 steps")]
+    found += [
+        ("a", "view 1: 3 of 30, first at 2; it jitters: slow"),
+        ("b", "view 1: 4 of 20, first at 9; it jitters: slow"),
+    ]
     assert alike_findings(found) == [
         AlikeFindings("3 of 30 steps", ("a", "c")),
+        AlikeFindings("view 1: 3 of 30, first at 2; it jitters: slow", ("a", "b")),
         AlikeFindings("no action", ("b",)),
     ]
+
+
+def test_numbers_in_names_tell_findings_apart() -> None:
+    """The like of arm1 is not arm2; a name may be a number altogether."""
+    subjects = [
+        "low_dim arm1",
+        "low_dim arm2",
+        "view 1",
+        "view 2",
+        "view 1 left",
+        "view 2 left",
+        "view a: 1.5",
+        "view a: 2.5",
+    ]
+    said = [(f"e{k}", f"{subject}: missing at {k} of 30 steps") for k, subject in enumerate(subjects)]
+    assert alike_findings(said) == [AlikeFindings(sentence, (episode,)) for episode, sentence in said]
+    said = [("a", "no /arm1/joint for 3 steps"), ("b", "no /arm2/joint for 3 steps"), ("c", "no /arm-1 for 3 steps")]
+    assert len(alike_findings(said)) == 3
 
 
 def ingested(folder: Path) -> list[str]:

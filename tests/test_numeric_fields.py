@@ -98,3 +98,28 @@ def test_all_kinds_of_bodies_name_their_members_in_the_order_of_the_schema() -> 
 
 def test_how_a_multi_array_lies_is_not_plotted_beside_what_it_holds() -> None:
     assert series({"layout": {"dim": [], "data_offset": 0}, "data": [1.0, 2.0]}) == {"data": {"0": 1.0, "1": 2.0}}
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["hip", "knee"], ["hip", "knee"]),
+        (["hip", "hip"], ["0", "1"]),
+        (["hip", "hip\x1b"], ["0", "1"]),
+        (["hip", "\x1b"], ["0", "1"]),
+        (["hip"], ["0", "1"]),
+        (["left\narm", "\ud800b"], ["left arm", "b"]),
+    ],
+)
+def test_a_list_goes_by_its_places_unless_each_of_its_numbers_has_a_name_of_its_own(
+    names: list[str], expected: list[str]
+) -> None:
+    said = {"name": names, "position": [1.0, 2.0]}
+    assert series(said) == {"position": dict(zip(expected, [1.0, 2.0], strict=True))}
+    array = Message("/t", "array", 0, 0, np.array([1.0, 2.0]))
+    assert numeric_series(array, names) == {"": dict(zip(expected, [1.0, 2.0], strict=True))}
+
+
+def test_items_go_by_names_that_can_be_shown() -> None:
+    items = [{"name": "\x1b[1mhip", "angle": 1.0}, {"name": "\x07", "angle": 2.0}]
+    assert series({"joints": items}) == {"angle": {"[1mhip": 1.0, "1": 2.0}}

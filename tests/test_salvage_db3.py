@@ -7,21 +7,20 @@ import sqlite3
 import struct
 import time
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from tests.damage import Sent, cuts, invented, mutated, read_log, salvaged, write_db3
+from tests.damage import Sent, cuts, invented, mutated, read_log, salvaged, write_db3, write_two_tables
 from tests.real_data import real_data
 from vilp_data import limits
 from vilp_data.errors import LogError
 from vilp_data.salvage import salvage_log
 from vilp_data.sources import open_log
-from vilp_data.sources.db3_salvage import RowRanges
+from vilp_data.sources.sqlite_pages import LEAF
 
 HUMBLE = get_typestore(Stores.ROS2_HUMBLE)
 STEPS = [pytest.param(12, id="some"), pytest.param(100, id="every percent", marks=pytest.mark.slow)]
@@ -180,6 +179,18 @@ def test_a_damaged_page_costs_the_rows_in_it(tmp_path: Path) -> None:
     assert invented(found, sent) == 0
     assert len(sent) - 20 < len(found) < len(sent)
     assert not report.complete
+
+
+def test_a_message_above_the_limit_costs_no_other_one_of_a_sound_db3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = write_db3(tmp_path / "run.db3", n=60, longest=9000)
+    monkeypatch.setattr(limits, "RECORD_BYTES", 8500)
+    found, report = salvaged(tmp_path / "run.db3")
+    assert report is not None
+    assert not report.complete
+    assert found == [message for message in sent if len(message.data) < 8480]
+    assert 40 < len(found) < 60
 
 
 def test_what_lies_in_the_journal_of_a_killed_recorder_is_taken_in_and_the_bag_is_not_touched(tmp_path: Path) -> None:
@@ -346,13 +357,121 @@ def test_a_definition_or_a_name_that_is_not_all_there_is_none(tmp_path: Path) ->
         assert next(iter(log.messages(["/t0"]))).body.data == sent[0].data[8:-1].decode()
 
 
-# --- what is remembered -----------------------------------------------------------------------------------------------
+# --- rows that are no messages ----------------------------------------------------------------------------------------
 
 
-@given(st.lists(st.integers(-5, 40)))
-def test_ranges_of_rows_know_what_a_set_knows(numbers: list[int]) -> None:
-    ranges, seen = RowRanges(), set[int]()
-    for number in numbers:
-        assert ranges.add(number) == (number not in seen)
-        seen.add(number)
-    assert len(ranges) == sum(number - 1 not in seen for number in seen)
+def written_beside_thumbs(path: Path, *, topic_id: int, without_roots: bool) -> tuple[list[Sent], bytes]:
+    """What was sent, and a bag that lacks its last page; it has another table of the same shape, with rows of topic `topic_id` under
+    the same ids. `without_roots`: nothing leads to the leaves of either."""
+    sent, roots = write_two_tables(path, topic_id=topic_id)
+    content = bytearray(path.read_bytes()[:-512])
+    for root in (roots["messages"], roots["thumbs"]) if without_roots else ():
+        content[root * 512 - 512 : root * 512] = bytes(512)
+    return sent, bytes(content)
+
+
+def test_rows_of_another_table_are_no_messages(tmp_path: Path) -> None:
+    sent, content = written_beside_thumbs(tmp_path / "run.db3", topic_id=1, without_roots=False)
+    found, report = salvaged(tmp_path / "cut.db3", content)
+    assert report is not None
+    assert found == sent[: len(found)]
+    assert len(found) > 110
+    assert len(report.doubts) == 1
+
+
+def test_rows_of_another_table_to_which_nothing_leads_replace_no_message(tmp_path: Path) -> None:
+    sent, content = written_beside_thumbs(tmp_path / "run.db3", topic_id=1, without_roots=True)
+    found, report = salvaged(tmp_path / "cut.db3", content)
+    assert report is not None
+    assert len(set(found) & set(sent)) > 110
+    told = " ".join(report.doubts)
+    assert f"{len(found)} messages in pages that the table of messages no longer leads to" in told
+    assert "rows under the id of another one that is unlike it" in told
+
+
+def test_rows_whose_topic_is_not_known_stand_for_no_message(tmp_path: Path) -> None:
+    sent, content = written_beside_thumbs(tmp_path / "run.db3", topic_id=99, without_roots=True)
+    found, report = salvaged(tmp_path / "cut.db3", content)
+    assert report is not None
+    assert found == sent[: len(found)]
+    assert len(found) > 110
+    assert any("180 messages are left out" in doubt for doubt in report.doubts)
+
+
+def test_of_two_unlike_rows_under_one_id_that_of_the_messages_tree_is_taken(tmp_path: Path) -> None:
+    """Nothing leads to the other table's rows, which lie before the messages; 60 of them have ids of their own."""
+    path = tmp_path / "run.db3"
+    sent, roots = write_two_tables(path)
+    content = bytearray(path.read_bytes())
+    content[roots["thumbs"] * 512 - 512 : roots["thumbs"] * 512] = bytes(512)
+    found, report = salvaged(path, bytes(content))
+    assert report is not None
+    assert found[:120] == sent
+    assert len(found) == 180
+    told = " ".join(report.doubts)
+    assert "60 messages in pages that" in told
+    assert "120 rows under the id of another one" in told
+
+
+def test_a_row_that_lies_in_two_pages_is_one_message(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent = write_db3(path, n=60)
+    content = bytearray(path.read_bytes())
+    pages = [bytes(content[place : place + 4096]) for place in range(4096, len(content), 4096)]
+    content += b"".join(page for page in pages if page[0] == LEAF)
+    content[28:32] = (1000).to_bytes(4, "big")  # pages, as if more had been cut off
+    found, report = salvaged(path, bytes(content))
+    assert report is not None
+    assert found == sent
+    assert len(report.doubts) == 1
+
+
+def test_a_table_of_messages_whose_name_is_damaged_is_no_other_table(tmp_path: Path) -> None:
+    sent = write_db3(tmp_path / "run.db3", n=60)
+    content = (tmp_path / "run.db3").read_bytes()[:-4096].replace(b"tablemessages", b"tablemessagez")
+    found, report = salvaged(tmp_path / "cut.db3", content)
+    assert report is not None
+    assert found == sent[: len(found)]
+    assert len(found) > 50
+    assert any(f"{len(found)} messages in pages that" in doubt for doubt in report.doubts)
+
+
+def test_deleted_rows_whose_pages_the_cut_file_no_longer_lists_as_free_are_doubted(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent = write_db3(path, n=300)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA secure_delete = OFF")
+        database.execute("DELETE FROM messages WHERE id > 250")  # the first page that comes free lists the others
+        database.execute("DELETE FROM messages WHERE id <= 100")
+        database.commit()
+    content = path.read_bytes()
+    (lists,) = struct.unpack_from(">I", content, 32)
+    found, report = salvaged(tmp_path / "cut.db3", content[: (lists - 1) * 4096])
+    assert report is not None
+    again = len(set(found) & {*sent[:100], *sent[250:]})
+    assert again
+    assert any(f"{again} messages in pages that" in doubt and "deleted" in doubt for doubt in report.doubts)
+
+
+@pytest.mark.slow
+def test_pages_full_of_row_ids_at_random_cost_no_time(tmp_path: Path) -> None:
+    rng, path = random.Random(0), tmp_path / "run.db3"
+    write_db3(path, n=1, page=65536)
+    content = bytearray(path.read_bytes())
+    record = bytes([5, 0, 9, 8, 12])
+    for _ in range(64):
+        cells = [
+            b"\x05" + struct.pack(">I", rng.getrandbits(32) | 0x80808000)[:3] + bytes([rng.randrange(128)]) + record
+            for _ in range(5000)
+        ]
+        pointers = struct.pack(">5000H", *range(65536 - 10 * 5000, 65536, 10))
+        content += (bytes([LEAF, 0, 0]) + struct.pack(">H", 5000) + bytes(3) + pointers).ljust(
+            65536 - 10 * 5000, b"\0"
+        ) + b"".join(cells)
+    content[28:32] = (len(content) // 65536 + 10).to_bytes(4, "big")
+    begin = time.process_time()
+    found, report = salvaged(path, bytes(content))
+    assert time.process_time() - begin < 10
+    assert len(found) > 100
+    assert report is not None
+    assert any("left out, whose ids do not fit" in doubt for doubt in report.doubts)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vilp_data.spec import VectorSpec
-from vilp_data.types import F32
-from vilp_data.vector_parts import differing_parts, shared_names, vector_parts
+from vilp_data.types import F32, ColumnNames
+from vilp_data.vector_parts import names_that_differ, shared_names, stated_names, vector_parts
 
 
 @given(widths=st.lists(st.integers(1, 4), max_size=4), n_steps=st.integers(0, 5))
@@ -61,10 +61,56 @@ def test_names_that_do_not_fit_the_vector_are_not_believed() -> None:
     assert parts["xy"][0] == ["x", "y"]
 
 
+@pytest.mark.parametrize(
+    ("fields", "names", "labels"),
+    [
+        (["linear.x", "angular.x"], [], ["linear.x", "angular.x"]),
+        (["position[0:1]", "velocity[0:1]"], [], ["position.0", "velocity.0"]),
+        (["position", "velocity"], ["hip"], ["position.hip", "velocity.hip"]),
+        (["msg.position[3:5]"], [], ["3", "4"]),
+        (["speed", "speed"], [], ["0", "1"]),
+        (["joints[1:2].position", "speed"], [], ["position", "speed"]),
+    ],
+)
+def test_what_a_task_calls_its_numbers_tells_them_apart(fields: list[str], names: list[str], labels: list[str]) -> None:
+    assert stated_names(VectorSpec(topic="/a", fields=fields, names=names)) == labels
+
+
+@pytest.mark.parametrize(
+    ("fields", "told", "labels"),
+    [
+        (["data[2:5]"], ["", "hip", ""], ["2", "hip", "4"]),
+        ([], ["", "hip", ""], ["0", "hip", "2"]),
+        ([], ["", "0", ""], ["[0]", "0", "[2]"]),
+        (["data[2:5]"], ["", "2", ""], ["[0]", "2", "[2]"]),
+        (["pose"], ["", "", ""], ["0", "1", "2"]),
+    ],
+)
+def test_a_number_that_its_log_does_not_name_goes_by_what_the_task_says(
+    fields: list[str], told: list[str], labels: list[str]
+) -> None:
+    parts = vector_parts(np.zeros((1, 3), np.float32), {"a": VectorSpec(topic="/a", fields=fields)}, {"a": told})
+    assert [found for found, _ in parts.values()] == [labels]
+
+
+def low_dim(*names: str) -> ColumnNames:
+    return {"low_dim": {"arm": list(names)}}
+
+
 def test_episodes_share_a_name_where_all_that_say_it_agree() -> None:
-    one, other = {"low_dim": {"arm": ["hip", "knee"]}}, {"low_dim": {"arm": ["hip", "toe"]}}
+    one, other, unnamed = low_dim("hip", "knee"), low_dim("hip", "toe"), low_dim("", "")
     assert shared_names([one, {}, one], "low_dim") == {"arm": ["hip", "knee"]}
-    assert shared_names([one, other], "low_dim") == {"arm": ["hip", "1"]}
-    assert shared_names([one, {"low_dim": {"arm": ["hip"]}}], "low_dim") == {}
-    assert differing_parts([one, {}, one]) == []
-    assert differing_parts([one, other]) == ["low_dim.arm"]
+    assert shared_names([one, other], "low_dim") == {"arm": ["hip", ""]}
+    assert shared_names([one, unnamed], "low_dim") == {"arm": ["hip", "knee"]}
+    assert shared_names([one, low_dim("hip")], "low_dim") == {}
+    assert shared_names([low_dim("hip", ""), low_dim("", "hip")], "low_dim") == {"arm": ["", ""]}
+
+
+def test_what_episodes_call_differently_is_said() -> None:
+    one, other = low_dim("hip", "knee"), low_dim("hip", "toe")
+    assert list(names_that_differ([one, {}, one, low_dim("", "")])) == []
+    (sentence,) = names_that_differ([one, other])
+    assert "low_dim.arm differently" in sentence
+    assert list(names_that_differ([low_dim("0", "1"), low_dim("1", "0")]))
+    assert list(names_that_differ([low_dim("hip", ""), low_dim("", "hip")]))
+    assert list(names_that_differ([one, low_dim("hip")]))

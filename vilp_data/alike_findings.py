@@ -1,4 +1,6 @@
-"""Ingest findings that say the same of many episodes, told once: they differ in their numbers alone. Pure."""
+"""Ingest findings that say the same of many episodes, told once: they differ in their numbers alone. Pure.
+
+A number in a name is none of them. A finding names its part or view first (`view arm1: 3 of 30 steps …`), and counts after that."""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-_NUMBER = re.compile(r"\d+(\.\d+)?")
+_COUNT = re.compile(r"(?<!\S)\d+(\.\d+)?(?!\.\d|[\w:])")
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ def alike_findings(found: Iterable[tuple[str, str]]) -> list[AlikeFindings]:
     """(episode, sentence) pairs put together, those that concern most episodes first."""
     groups: dict[str, list[tuple[str, str]]] = {}
     for episode, sentence in found:
-        groups.setdefault(_NUMBER.sub("N", sentence), []).append((episode, sentence))
+        subject, colon, said = sentence.partition(": ") if ": " in sentence else ("", "", sentence)
+        groups.setdefault(subject + colon + _COUNT.sub("N", said), []).append((episode, sentence))
     inorder = sorted(groups.values(), key=lambda group: (-len(group), group[0]))
     return [AlikeFindings(group[0][1], tuple(episode for episode, _ in group)) for group in inorder]

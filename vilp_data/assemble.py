@@ -14,7 +14,6 @@ from vilp_data.held_messages import messages_before, static_messages
 from vilp_data.sources import IndexedLog
 from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
 from vilp_data.types import F32, F64, I64, Bool, ColumnNames, Episode, LogEpisode, LogReader, outcome_of
-from vilp_data.vector_parts import Parts, stated_names
 from vilp_data.vector_tracks import FieldsTrack, Track, Tracks, VectorTracks, age_names, no_message, stamp_ns
 from vilp_data.video_start import packets_before
 from vilp_data.view_frames import Seen, Ticks, ViewFrames
@@ -66,7 +65,7 @@ def assemble_episode(
     valid = {f"view {view}": images.valid for view, images in views.items()}
     valid |= {f"low_dim {name}": part.valid for name, part in low_dim.items()}
     valid |= {f"action {name}": part.valid for name, part in action.items()}
-    findings = tuple(_findings(valid, views, action))
+    findings = (*_findings(valid, views, action), *_named_two_ways(tracks))
     usable: Bool = np.logical_and.reduce(list(valid.values()))
     if not usable.any():
         raise AlignError(
@@ -93,7 +92,7 @@ def assemble_episode(
         tags=dict(demonstration.tags),
         outcome=outcome_of(demonstration.tags),
         findings=findings,
-        column_names=_column_names(spec, tracks, action),
+        column_names=column_names(spec, {part: tracks[part].column_names for part in tracks}, has_action=bool(action)),
     )
 
 
@@ -248,20 +247,16 @@ def _as_stored(values: F64) -> F32:
         return values.astype(np.float32)
 
 
-def _column_names(spec: TaskSpec, tracks: Tracks, action: Collection[str]) -> ColumnNames:
-    """What the log calls the numbers of each part, where the task's own fields do not call them so already."""
-    named: dict[str, dict[str, list[str]]] = {"low_dim": {}, "action": {}}
+def column_names(spec: TaskSpec, told: Mapping[str, Sequence[str]], *, has_action: bool) -> ColumnNames:
+    """`Episode.column_names`, of what is told of the parts ("low_dim.<name>", "action.<name>") that are read from messages."""
+    found: dict[str, dict[str, list[str]]] = {}
     for part in spec.low_dim:
-        named["low_dim"][part] = list(tracks[f"low_dim.{part}"].column_names)
-    for part in action:
-        source = spec.action[part].from_
-        named["action"][part] = named["low_dim"][source] if source else list(tracks[f"action.{part}"].column_names)
-    stated: dict[str, Parts] = {"low_dim": spec.low_dim, "action": spec.action}
-    more = {
-        vector: {part: names for part, names in parts.items() if names and names != stated_names(stated[vector][part])}
-        for vector, parts in named.items()
-    }
-    return {vector: parts for vector, parts in more.items() if parts}
+        if names := told.get(f"low_dim.{part}"):
+            found.setdefault("low_dim", {})[part] = list(names)
+    for part, table in spec.action.items() if has_action else ():
+        if names := told.get(f"low_dim.{table.from_}" if table.from_ else f"action.{part}"):
+            found.setdefault("action", {})[part] = list(names)
+    return found
 
 
 # --- what the user should know ------------------------------------------------------------------------------------------
@@ -293,6 +288,15 @@ def refuse_short_stride(spec: TaskSpec, view_stamps: Mapping[str, I64], rate_hz:
             raise SpecError(
                 f"planned frames {stride_s:.3f} s apart are closer than view {view!r} takes images, every {period_s:.3f} s",
                 remedy="raise window.frame_stride, or lower rate_hz",
+            )
+
+
+def _named_two_ways(tracks: Tracks) -> Iterator[str]:
+    for part, track in tracks.items():
+        if track.names_differ:
+            yield (
+                f"{part.replace('.', ' ')}: messages of its topic name their numbers differently, so its columns may not mean the same"
+                " throughout; `names` in the task reads joints in one order"
             )
 
 

@@ -23,7 +23,7 @@ from vilp_data.spec import ActionSpec, TaskSpec, VectorSpec
 from vilp_data.split_lock import SplitLock
 from vilp_data.stats import ChannelStats
 from vilp_data.types import F32, U8
-from vilp_data.vector_parts import differing_parts, shared_names, vector_parts
+from vilp_data.vector_parts import names_that_differ, shared_names, vector_parts
 
 SHEET_EPISODES, SHEET_TIMES = 6, 6
 SHEET_WIDTH = 160
@@ -237,10 +237,8 @@ def _vectors(
                 rows.append([f"`{name}[{number}]`", f"{part}.{label}".strip("."), _meaning(parts.get(part)), *values])
         if list(columns) == [""] and len(parts) > 1:
             untold.append(f"The task does not say how wide each part of {name} is; in order: {', '.join(parts)}.")
-    if differing := differing_parts(entry.column_names for entry in entries):
-        untold.append(
-            f"Logs name the numbers of {', '.join(differing)} differently: the columns may not mean the same."
-        )
+    differing = names_that_differ(entry.column_names for entry in entries)
+    untold += [f"{sentence[0].upper()}{sentence[1:]}." for sentence in differing]
     if not rows:
         yield "Images alone."
         return

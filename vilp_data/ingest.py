@@ -33,7 +33,7 @@ from vilp_data.removed import read_removed, removed_bytes, removed_path
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import RATE_TOLERANCE, Episode
-from vilp_data.vector_parts import differing_parts
+from vilp_data.vector_parts import names_that_differ
 from vilp_data.writer_lock import remove_leftovers, writer_lock
 
 EPISODES_PER_JOB = 8
@@ -134,8 +134,9 @@ def ingest_logs(
         _keep_removed(root, plan.removed, report, met, work)
         _adopt(store, met, report, spec, work)
         store.ensure_index()
-        stored = store.index() if report.written else []
-        report.notes += [*notes_on_others(plan, report.written), *_twins(stored, report.written), *_other_names(stored)]
+        stored = store.index() if report.written or report.restated else []
+        report.notes += [*notes_on_others(plan, report.written), *_twins(stored, report.written)]
+        report.notes += names_that_differ(entry.column_names for entry in stored)
         report.written.sort()
         report.failed.sort()
         report.replaced = sorted(plan.replaced.intersection(report.written))
@@ -218,15 +219,6 @@ def _twins(stored: Sequence[EpisodeEntry], written: Sequence[str]) -> Iterator[s
     for ids in alike.values():
         if len(ids) > 1 and not set(ids).isdisjoint(written):
             yield f"{some_of(ids, 5)}: show the same; each is kept, all on one side of the split"
-
-
-def _other_names(stored: Sequence[EpisodeEntry]) -> Iterator[str]:
-    """A sentence about each part whose columns do not mean the same in all episodes, as far as their logs tell."""
-    for part in differing_parts(entry.column_names for entry in stored):
-        yield (
-            f"{part}: logs name its numbers differently, so its columns may not mean the same; `names` in the task reads joints in one"
-            " order"
-        )
 
 
 def _write_spec(store: EpisodeStore, spec: TaskSpec, work: Recording) -> None:

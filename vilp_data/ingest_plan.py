@@ -25,6 +25,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
+from vilp_data.assemble import column_names
 from vilp_data.cut_identity import Cut
 from vilp_data.demonstrations import CUT_TAG, LOG_TAG
 from vilp_data.edits import Edits, edits_of, restated
@@ -37,7 +38,7 @@ from vilp_data.known_content import KnownContent, known_contents, written_anew
 from vilp_data.log_hashes import HashCache
 from vilp_data.removed import Removed, RemovedEpisode, read_removed
 from vilp_data.spec import TaskSpec
-from vilp_data.types import is_rollout, outcome_of
+from vilp_data.types import ColumnNames, is_rollout, outcome_of
 
 Unwanted = Literal["left_out", "rollouts"]
 
@@ -209,7 +210,8 @@ def told_today(entry: EpisodeEntry, source: Source, spec: TaskSpec) -> tuple[Epi
     if source.cut is not None:
         name = source.demonstration.name
         tags |= {LOG_TAG: entry.tags[LOG_TAG]} if LOG_TAG in entry.tags else {}
-    today, notes = replace(restated(entry, tags), source_episode=name), []
+    names, notes = _names_today(entry, source, spec), []
+    today = replace(restated(entry, tags), source_episode=name, column_names=names)
     if source.log.name != entry.source:
         told = tags_said_otherwise(today.tags, entry.tags)
         note = f"{source.log}: holds {entry.id} of {entry.source}, whose labels stay: {told}; `vilp-data relabel {entry.id}` changes them"
@@ -219,6 +221,15 @@ def told_today(entry: EpisodeEntry, source: Source, spec: TaskSpec) -> tuple[Epi
     if today.outcome == "failure" != entry.outcome:
         notes.append(failure_note(entry.id))
     return today, notes
+
+
+def _names_today(entry: EpisodeEntry, source: Source, spec: TaskSpec) -> ColumnNames:
+    """The entry's names with those that its log gives today beside its messages; the others are of its messages, and the same."""
+    stored = {
+        f"{vector}.{part}": names for vector, parts in entry.column_names.items() for part, names in parts.items()
+    }
+    told = {part: names or [""] * len(stored.get(part, ())) for part, names in source.told.items()}
+    return column_names(spec, stored | told, has_action=entry.has_action)
 
 
 def failure_note(id: str) -> str:

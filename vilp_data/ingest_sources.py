@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from vilp_data.cut_identity import Cut, cut_sha256
 from vilp_data.cut_log import cut_log
+from vilp_data.decode import decode_vector
+from vilp_data.decode.column_names import ColumnNames
 from vilp_data.demonstrations import LOG_TAG
 from vilp_data.errors import DecodeError, LogError, SpecError, some_of
 from vilp_data.held_messages import held_sha256
@@ -18,6 +22,10 @@ from vilp_data.log_hashes import HashCache
 from vilp_data.sources import IndexedLog, open_log
 from vilp_data.spec import TaskSpec
 from vilp_data.types import LogEpisode
+from vilp_data.vector_tracks import vector_tables
+
+ARRAY = "array"
+"""What readers of tables and arrays call the schema of their numbers."""
 
 HELD = "held"
 """Where `EpisodeEntry.cut` says what a cut was made of besides its own messages."""
@@ -31,7 +39,9 @@ def held_of(cut: Mapping[str, Any]) -> str:
 @dataclass(frozen=True)
 class Source:
     """One demonstration of one log, before it is known which episode it is. `alone`: its log holds no other. `cut`: where it was cut out
-    of its log, None for a log's own. `held`: SHA-256 of what a cut is made of besides its own messages, "" where that is nothing."""
+    of its log, None for a log's own. `held`: SHA-256 of what a cut is made of besides its own messages, "" where that is nothing.
+    `told`: part -> what the log calls the numbers of its arrays today, of parts that are read from arrays; empty where it
+    calls them nothing."""
 
     log: Path
     demonstration: LogEpisode
@@ -39,6 +49,7 @@ class Source:
     alone: bool
     cut: Cut | None = None
     held: str = ""
+    told: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def made_of(self) -> tuple[str, str]:
@@ -114,18 +125,37 @@ def _read_log(
     demonstrations = [replace(one, tags={**told, **one.tags}) for one in cuts.demonstrations]
     if spec.episodes.kind == "file":
         alone = len(natives) == 1
-        return [Source(path, one, hashes[one.name], alone) for one in demonstrations], [], notes
+        names = _names_of_arrays(log, spec)
+        return [Source(path, one, hashes[one.name], alone, told=names) for one in demonstrations], [], notes
     topics = tuple(sorted({topic.name for topic in log.topics()}.intersection(spec.topics())))
-    found = []
+    found, names = [], _names_of_arrays(log, spec)
     for one in demonstrations:
         cut = Cut(one.start_ns, one.end_ns, topics)
         native = hashes[cuts.native[one.name]]
         sha256, held = cut_sha256(log, cut, native, remember), held_sha256(log, one, spec, native, remember)
-        found.append(Source(path, one, sha256, alone=False, cut=cut, held=held))
+        found.append(Source(path, one, sha256, alone=False, cut=cut, held=held, told=names))
     today = {source.sha256 for source in found}
     others = [one for one in known if one.sha256 not in today]
     still = [one for one in others if _holds(log, natives, hashes, one, remember)]
     return found, others if _is_same_log(known, others, still) else still, notes
+
+
+def _names_of_arrays(log: IndexedLog, spec: TaskSpec) -> dict[str, Sequence[str]]:
+    """`Source.told`: names that a log gives beside its messages may change while these do not; one message says how wide a part is."""
+    topics, told = {topic.name: topic for topic in log.topics()}, dict[str, Sequence[str]]()
+    for part, table in vector_tables(spec).items():
+        topic = topics.get(str(table.topic))
+        if topic is None or topic.schema != ARRAY or table.names:
+            continue
+        if not topic.names:
+            told[part] = ()
+            continue
+        names = ColumnNames(table.fields, topic.names)
+        with suppress(LogError, DecodeError):  # said where it is ingested
+            for message in islice(log.messages([topic.name]), 1):
+                names.add(message, len(decode_vector(message, table.fields)))
+                told[part] = names.names
+    return told
 
 
 def _is_same_log(known: Sequence[KnownCut], others: Sequence[KnownCut], still: Sequence[KnownCut]) -> bool:

@@ -11,9 +11,10 @@ import numpy as np
 
 from vilp_data import align, decode, rotations
 from vilp_data.align import NEVER_NS, Latest
-from vilp_data.decode.column_names import column_names
+from vilp_data.decode.column_names import ColumnNames
 from vilp_data.decode.vectors import concerns, published_names, rotation_columns
 from vilp_data.errors import DecodeError, LogError, nearest
+from vilp_data.short_names import short_names
 from vilp_data.spec import ActionSpec, TaskSpec, TopicSpec, VectorSpec
 from vilp_data.transform_tree import TransformTrack, TransformTree
 from vilp_data.transforms import STATIC, Link, links_of, pick_columns, picked_names
@@ -26,7 +27,8 @@ VectorTable: TypeAlias = VectorSpec | ActionSpec
 
 class Track(Protocol):
     """One part's vectors in order of its topic's clock. `stamps_ns`: when something came, int64 [M] ascending; `held_s`: how long
-    before the demonstration the first message came that is not of it, 0 where there is none such; `column_names`: of its numbers."""
+    before the demonstration the first message came that is not of it, 0 where there is none such; `column_names`: of its
+    numbers, as `ColumnNames.names`; `names_differ`: whether its messages gave two."""
 
     @property
     def held_s(self) -> float: ...
@@ -34,6 +36,8 @@ class Track(Protocol):
     def stamps_ns(self) -> I64: ...
     @property
     def column_names(self) -> tuple[str, ...]: ...
+    @property
+    def names_differ(self) -> bool: ...
 
     def known_ns(self) -> I64:
         """Those of `stamps_ns` that are of the demonstration itself, and at which every number is known."""
@@ -155,7 +159,7 @@ class _FieldsReader:
 
     def __init__(self, table: VectorTable, demonstration: LogEpisode, topic_names: Sequence[str]) -> None:
         self._table, self._topic, self._start_ns = table, str(table.topic), demonstration.start_ns
-        self._topic_names, self._column_names = topic_names, tuple[str, ...]()
+        self._names = None if table.names else ColumnNames(table.fields, topic_names)  # the task's own, else the log's
         self._read = decode.compile_fields(table.fields, table.names)
         self._stamps, self._rows = array("q"), _Rows(self._topic)
         self._before = array("q")  # log times of the rows that came before the demonstration: the first ones
@@ -171,9 +175,10 @@ class _FieldsReader:
         if message.log_time_ns < self._start_ns:
             self._before.append(message.log_time_ns)
         self._stamps.append(stamp_ns(message, self._table))
-        self._rows.append(self._read(message))
-        if len(self._stamps) == 1:
-            self._column_names = column_names(message, self._table.fields, self._table.names, self._topic_names)
+        row = self._read(message)
+        self._rows.append(row)
+        if self._names is not None:
+            self._names.add(message, len(row))
 
     def track(self, where: str) -> FieldsTrack:
         if not self._stamps:
@@ -187,7 +192,8 @@ class _FieldsReader:
             values[:, column : column + 4] = rotations.continuous(values[:, column : column + 4])
         held_s = (self._start_ns - self._before[-1]) / 1e9 if first < n_before else 0.0
         own_ns = int(stamps_ns[n_before:].min()) if n_before < len(stamps_ns) else None
-        return FieldsTrack(stamps_ns[first:][order], values, own_ns, held_s, self._column_names)
+        names, differ = (self._names.names, self._names.differ) if self._names is not None else ((), False)
+        return FieldsTrack(stamps_ns[first:][order], values, own_ns, held_s, names, differ)
 
     def _nothing(self, where: str) -> LogError:
         if self._others:
@@ -223,6 +229,7 @@ class FieldsTrack:
     own_ns: int | None = None
     held_s: float = 0.0
     column_names: tuple[str, ...] = ()
+    names_differ: bool = False
 
     def known_ns(self) -> I64:
         if self.own_ns is None:
@@ -302,10 +309,11 @@ class ColumnsTrack:
     topic: str
     own_ns: int | None
     held_s: float = 0.0
+    names_differ: bool = False
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        return picked_names(self.fields)
+        return short_names([name.split(".") for name in picked_names(self.fields)])
 
     @property
     def stamps_ns(self) -> I64:

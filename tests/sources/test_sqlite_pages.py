@@ -6,13 +6,16 @@ import io
 import sqlite3
 import struct
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from tests.damage import Sent, write_db3
-from vilp_data.sources.sqlite_pages import LEAF, MessageRow, file_head, message_rows
+from tests.damage import Sent, write_db3, write_two_tables
+from vilp_data.sources.sqlite_pages import LEAF, OPEN, MessagePages, MessageRow, file_head, longest_ascending
 
 SHAPES: dict[str, dict[str, Any]] = {
     "small pages": {"page": 512, "longest": 3000},
@@ -23,8 +26,12 @@ SHAPES: dict[str, dict[str, Any]] = {
 
 
 def rows_of(content: bytes, *, whole: int | None = None, largest: int = 1 << 30) -> list[MessageRow]:
+    return list(pages_of(content, whole=whole, largest=largest).rows())
+
+
+def pages_of(content: bytes, *, whole: int | None = None, **options: Any) -> MessagePages:
     whole = len(content) if whole is None else whole
-    return list(message_rows(io.BytesIO(content), len(content), whole=whole, largest=largest))
+    return MessagePages(io.BytesIO(content), len(content), whole=whole, **({"largest": 1 << 30} | options))
 
 
 def as_sent(rows: list[MessageRow]) -> list[Sent]:
@@ -92,6 +99,94 @@ def test_a_row_that_goes_on_in_a_page_of_zeros_behind_the_cut_is_missing_and_one
     assert [row.number for row in rows_of(content, whole=len(content) - 4096)] == [*range(1, 7), *range(8, 21)]
 
 
+# --- trees ------------------------------------------------------------------------------------------------------------
+
+
+def test_rows_of_another_tables_tree_are_none_and_those_of_the_messages_tree_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent, roots = write_two_tables(path)
+    own, content = roots.pop("messages"), bytearray(path.read_bytes())
+    rows = list(pages_of(bytes(content), own=own, others=roots.values()).rows())
+    assert as_sent(rows) == sent
+    assert all(row.led_to for row in rows)
+    content[own * 512 - 512 : own * 512] = bytes(512)
+    rows = list(pages_of(bytes(content), own=own, others=roots.values()).rows())
+    assert as_sent(rows) == sent
+    assert not any(row.led_to for row in rows)
+
+
+def test_a_leaf_to_which_two_trees_lead_is_of_none_for_sure(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent, roots = write_two_tables(path)
+    own, content = roots["messages"], path.read_bytes()
+    rows = list(pages_of(content, own=own, others=roots.values()).rows())
+    assert as_sent(rows) == sent
+    assert not any(row.led_to for row in rows)
+
+
+def test_trees_that_lead_in_circles_end(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    sent, roots = write_two_tables(path)
+    own, content = roots.pop("messages"), bytearray(path.read_bytes())
+    content[own * 512 - 512 + 8 : own * 512 - 512 + 12] = own.to_bytes(4, "big")  # its last page is itself
+    rows = list(pages_of(bytes(content), own=own, others=roots.values()).rows())
+    assert as_sent(rows) == sent
+    assert {row.led_to for row in rows} == {True, False}
+
+
+# --- row ids ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.integers(0, 12), max_size=9))
+def test_the_longest_ascending_part_is_found(numbers: list[int]) -> None:
+    kept = longest_ascending(numbers)
+    chosen = [numbers[place] for place in kept]
+    assert list(kept) == sorted(set(kept))
+    assert chosen == sorted(set(chosen))
+    parts = (part for size in range(len(numbers) + 1) for part in combinations(numbers, size))
+    assert len(chosen) == max(len(part) for part in parts if list(part) == sorted(set(part)))
+
+
+def leaf_of(*ids: int, data: bytes = b"") -> bytes:
+    """A leaf of 4 kB with a message under each id."""
+    record = bytes([7, 0, 9, 6, *varint(12 + 2 * len(data))]) + bytes(8) + data
+    cells = [varint(len(record)) + varint(number) + record for number in ids]
+    at, pointers = 4096, b""
+    for cell in cells:
+        at -= len(cell)
+        pointers += struct.pack(">H", at)
+    head = bytes([LEAF, 0, 0]) + struct.pack(">H", len(ids)) + bytes(3)
+    return (head + pointers).ljust(at, b"\0") + b"".join(reversed(cells))
+
+
+def file_of(*leaves: bytes) -> bytes:
+    head = bytearray(4096)
+    head[16:18] = (4096).to_bytes(2, "big")
+    return bytes(head) + b"".join(leaves)
+
+
+def test_rows_come_in_order_of_their_ids_though_leaves_share_a_range() -> None:
+    pages = pages_of(file_of(leaf_of(4, 6, 7, 20), leaf_of(1, 2, 6, 9), leaf_of(10, 11)))
+    assert [row.number for row in pages.rows()] == [1, 2, 4, 6, 6, 7, 9, 10, 11, 20]
+    assert pages.left_out == 0
+
+
+@pytest.mark.parametrize("ids", [(1, 2, 900, 4, 5), (1, 2, 3, 0, 5), (900, 2, 3, 4), (1, 2, 3, 3)])
+def test_a_row_id_that_does_not_ascend_costs_its_row_alone(ids: tuple[int, ...]) -> None:
+    pages = pages_of(file_of(leaf_of(6, 7), leaf_of(*ids)))
+    assert len([row for row in pages.rows() if row.number < 6]) == len(ids) - 1
+    assert pages.left_out == 1
+
+
+def test_no_more_leaves_are_held_at_a_time_than_a_few_and_those_that_end_first_are_kept() -> None:
+    """Each reaches over all that begin after it."""
+    pages = pages_of(file_of(*(leaf_of(k, 9000 - k) for k in range(1, OPEN + 11))))
+    numbers = [row.number for row in pages.rows()]
+    assert numbers[: OPEN + 10] == list(range(1, OPEN + 11))
+    assert numbers[OPEN + 10 :] == [9000 - k for k in range(OPEN + 10, 10, -1)]
+    assert pages.left_out == 10
+
+
 # --- pages that lie ---------------------------------------------------------------------------------------------------
 
 
@@ -109,15 +204,18 @@ def test_chains_that_lead_astray_cost_the_rows_they_are_of_and_end(tmp_path: Pat
 
 
 def test_cells_that_share_their_bytes_give_no_more_than_a_page_holds() -> None:
-    """A page of 4 kB may point at one row of 2 kB six hundred times."""
-    record = bytes([7, 0, 1, 6, *varint(12 + 2 * 1900), 1]) + bytes(8) + bytes(1900)
-    cell = varint(len(record)) + b"\1" + record
-    head = bytearray(4096)
-    head[16:18] = (4096).to_bytes(2, "big")
-    many = (4096 - 8 - len(cell)) // 2
-    leaf = bytes([LEAF, 0, 0, *many.to_bytes(2, "big"), 0, 0, 0]) + struct.pack(">H", 4096 - len(cell)) * many
-    rows = rows_of(bytes(head) + leaf + bytes(4096 - len(leaf) - len(cell)) + cell)
-    assert 0 < len(rows) <= 2
+    """A page of 4 kB may hold rows one inside the other, each the data of the one around it."""
+    cell, starts = b"", []
+    for number in range(150, 0, -1):
+        record = bytes([7, 0, 9, 6, *varint(12 + 2 * len(cell))]) + bytes(8) + cell
+        cell = varint(len(record)) + varint(number) + record
+        starts.append(4096 - len(cell))
+    leaf = bytes([LEAF, 0, 0]) + struct.pack(">H3x150H", 150, *reversed(starts))
+    pages = pages_of(file_of(leaf.ljust(starts[-1], b"\0") + cell))
+    rows = list(pages.rows())
+    assert rows
+    assert sum(len(row.data) for row in rows) < 4096
+    assert pages.left_out == 150 - len(rows)
 
 
 def test_rows_that_share_their_chains_give_no_more_than_a_few_times_what_the_file_holds() -> None:

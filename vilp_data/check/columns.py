@@ -15,6 +15,7 @@ import numpy as np
 
 from vilp_data.decode import header_time_ns
 from vilp_data.decode.message_body import member, require_member, set_members
+from vilp_data.short_names import clean_name
 from vilp_data.types import Message
 
 LARGEST_VECTOR = 64
@@ -53,7 +54,7 @@ def columns_of(body: Any, names: Sequence[str] = ()) -> Columns | None:
         if body.ndim > 1 or body.size > LARGEST_VECTOR or body.dtype.kind not in "fiub":
             return None
         known = names if len(names) == body.size else [""] * body.size
-        labels = tuple(f"[{i}] {name}".strip() for i, name in enumerate(known))
+        labels = tuple(f"[{i}] {clean_name(name)}".strip() for i, name in enumerate(known))
         return Columns(labels, lambda array: np.atleast_1d(array).tolist())
     leaves = list(_leaves(body, ()))
     names = tuple(name for leaf in leaves for name in _labels(leaf))
@@ -121,8 +122,8 @@ def _follow(leaf: _Leaf, body: Any) -> Sequence[float]:
 
 
 def _labels(leaf: _Leaf) -> list[str]:
-    name = ".".join(leaf.path) + (f".{leaf.each}" if leaf.each else "")
-    return [f"{name}.{label}" for label in leaf.labels] if leaf.labels else [name]
+    name = ".".join(map(clean_name, leaf.path)) + (f".{clean_name(leaf.each)}" if leaf.each else "")
+    return [f"{name}.{clean_name(label)}" for label in leaf.labels] if leaf.labels else [name]
 
 
 def _leaves(value: Any, path: tuple[str, ...]) -> Iterator[_Leaf]:

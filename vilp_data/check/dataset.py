@@ -4,7 +4,7 @@ hash), every episode's vectors judged, two frames a second looked at."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +27,13 @@ from vilp_data.locate import is_dataset
 from vilp_data.spec import TaskSpec
 from vilp_data.split_lock import SplitLock
 from vilp_data.types import F32, F64, U8, Bool
-from vilp_data.vector_parts import vector_parts
+from vilp_data.vector_parts import shared_names, vector_parts
 from vilp_data.windows import valid_runs
 
 INVALID_SHARE = 0.2
 """An episode of which more steps are masked than this gives few windows, and deserves a look."""
 
-SERIOUS_NOTES = re.compile(r"damaged|older than|missing, stale")
+SERIOUS_NOTES = re.compile(r"damaged|older than|missing, stale|differently")
 """What ingest noted about an episode and what is more than a remark."""
 
 
@@ -63,6 +63,7 @@ class _Look:
         self.trajectories: list[Trajectory] = []
         self.moved: dict[str, Bool] = {}  # episode -> which columns of low_dim move in it
         self.columns: tuple[str, ...] = ()
+        self.shared = shared_names((entry.column_names for entry in entries), "low_dim")
 
     def run(self) -> Checked:
         if not self.entries:
@@ -99,17 +100,20 @@ class _Look:
         valid = np.asarray(arrays["valid"])
         found = [*self._masked(entry, valid, at_s), *self._ingest_notes(entry)]
         state = Series(
-            "low_dim", self._labels(entry, arrays, "low_dim"), at_s[valid], _values(arrays, "low_dim", valid)
+            "low_dim",
+            self._labels(arrays, "low_dim", entry.column_names.get("low_dim", {})),
+            at_s[valid],
+            _values(arrays, "low_dim", valid),
         )
         action = None
         if "action" in arrays:
-            labels = self._labels(entry, arrays, "action")
+            labels = self._labels(arrays, "action", entry.column_names.get("action", {}))
             action = Series("action", labels, at_s[valid], _values(arrays, "action", valid), command=True)
             found += series_findings(action)
         found += series_findings(state, busy=action)
         if state.values.shape[1]:
             self.moved[entry.id] = moving_columns(state.values)
-            self.columns = tuple(state.names)
+            self.columns = tuple(self._labels(arrays, "low_dim", self.shared))
         vectors = [arrays[name].astype(np.float64) for name in ("low_dim", "action") if name in arrays]
         idle = idle_ends(np.concatenate(vectors, axis=1), at_s, valid)  # as `trim` looks at it
         if idle is not None:
@@ -146,10 +150,11 @@ class _Look:
         return [sample_frame(frames[source_index[step]], float(at_s[step])) for step in steps]
 
     def _labels(
-        self, entry: EpisodeEntry, arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str
-    ) -> list[str]:
+        self, arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], vector: str,
+        names: Mapping[str, Sequence[str]],
+    ) -> list[str]:  # fmt: skip
         parts = self.spec.low_dim if vector == "low_dim" else self.spec.action
-        known = vector_parts(arrays[vector], parts, entry.column_names.get(vector, {}))
+        known = vector_parts(arrays[vector], parts, names)
         return [
             f"{part}.{label}" if part else f"{vector}[{label}]"
             for part, (labels, _) in known.items()

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from vilp_data.check.cameras import thumbnails_of
-from vilp_data.check.copies import imprint_of
 from vilp_data.check.findings import Finding, Place, Severity, placed, worst_first
 from vilp_data.check.log_judge import LogJudge, Segment
 from vilp_data.check.report import Checked, Sheet, TopicFacts
@@ -78,7 +77,6 @@ class _Reading:
         self.notes: dict[str, str] = {}  # topic -> why it was not looked at
         self.tracks: dict[str, Track] = {}
         self.thumbnails: dict[str, F32] = {}
-        self.imprints: dict[str, str] = {}
 
     def run(self) -> Checked:
         episodes, roles = list[LogEpisode](), Roles()
@@ -112,7 +110,7 @@ class _Reading:
             findings=tuple(worst_first(found)), size_bytes=_size(self.path),
             n_episodes=len(episodes), duration_s=(span[1] - span[0]) / 1e9 if episodes else 0.0,
             topics=tuple(self._facts(judge)), sheets=tuple(self._sheets(span[0], episodes)),
-            thumbnails=self.thumbnails, imprints=self.imprints, steps=judge.steps,
+            thumbnails=self.thumbnails, steps=judge.steps,
         )  # fmt: skip
 
     # --- before reading
@@ -188,8 +186,6 @@ class _Reading:
         judge.segment(Segment(episode, name, first, last=whole))
         if whole and count:
             judge.silences(name)
-            if (imprint := imprint_of(self.tracks)) is not None:
-                self.imprints[episode.name] = imprint
         parts = [small for track in self.tracks.values() if (small := thumbnails_of(track.seen)) is not None]
         if parts:
             self.thumbnails[episode.name] = np.concatenate(parts)

@@ -93,8 +93,8 @@ class Steps:
 
 @dataclass(frozen=True)
 class Checked:
-    """One log or dataset, looked at. `thumbnails` (name of each demonstration -> float32 [m,8,8]), `imprints` (name -> as in `copies`) and
-    `steps` are for judging it together with others."""
+    """One log or dataset, looked at. `thumbnails` (name of each demonstration -> float32 [m,8,8]) and `steps` are for judging it together
+    with others."""
 
     source: str
     kind: Literal["log", "dataset"]
@@ -106,7 +106,6 @@ class Checked:
     topics: tuple[TopicFacts, ...] = ()
     sheets: tuple[Sheet, ...] = ()
     thumbnails: Mapping[str, F32] = field(default_factory=dict)
-    imprints: Mapping[str, str] = field(default_factory=dict)
     steps: Steps | None = None
 
     def as_dict(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Literal
 
 from vilp_data.check.action import action_findings
 from vilp_data.check.action_fit import fit_action
-from vilp_data.check.copies import copies
+from vilp_data.check.copies import copies_finding, same_logs
 from vilp_data.check.dataset import check_dataset
 from vilp_data.check.findings import Finding, Place, worst_first
 from vilp_data.check.log import check_log
@@ -73,7 +73,10 @@ def check_sources(
                 progress(len(results), len(todo))
     checked = tuple(results[path] for path in todo)
     fits, found = _actions(checked)
-    return CheckReport(checked, (*copies(checked, _sha256), *found, *_look_alike(checked)), tuple(fits))
+    same = same_logs(checked, _sha256)
+    again = {source for sources in same for source in sources[1:]}
+    alike = _look_alike([one for one in checked if one.source not in again])
+    return CheckReport(checked, (*map(copies_finding, same), *found, *alike), tuple(fits))
 
 
 def _todo(paths: Sequence[Path]) -> Iterator[Path]:
@@ -145,10 +148,7 @@ def _look_alike(checked: Sequence[Checked]) -> Iterator[Finding]:
         for name, small in one.thumbnails.items()
     }
     several = {one.source: len(one.thumbnails) > 1 for one in checked}
-    imprints = {f"{one.source}{BETWEEN}{name}": imprint for one in checked for name, imprint in one.imprints.items()}
     for pair in near_duplicates(thumbnails):
-        if imprints.get(pair.first, pair.first) == imprints.get(pair.second, pair.second):
-            continue  # not nearly: `copies` has said so
         (source, _, episode), (other, _, twin) = pair.first.partition(BETWEEN), pair.second.partition(BETWEEN)
         named = twin if other == source else f"{other}, {twin}" if several[other] else other
         yield Finding(

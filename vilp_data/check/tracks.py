@@ -5,7 +5,6 @@ Memory is bounded by the segment, not by the log: `taken` hands out what was gat
 
 from __future__ import annotations
 
-import hashlib
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -62,9 +61,6 @@ class Track:
     odd_rows: int = 0  # messages whose numbers were of another shape than the first one's
     seen: list[FrameSample] = field(default_factory=list)  # every sampled image of this demonstration
     pictures: list[tuple[int, U8]] = field(default_factory=list)  # log time, picture
-    n_heard: int = 0  # messages of this demonstration
-    n_told: int = 0  # numbers and images kept of it
-    _said: hashlib._Hash = field(default_factory=hashlib.sha256)
     _stamp: Callable[[Message], int] | None = None
     _log: array[int] = field(default_factory=lambda: array("q"))
     _header: array[int] = field(default_factory=lambda: array("q"))
@@ -83,8 +79,6 @@ class Track:
         self._origin_ns, self._picture_step_ns = origin_ns, picture_step_ns
         self._next_sample_ns = self._next_row_ns = self._next_picture_ns = origin_ns
         self.seen = []
-        self.n_heard = self.n_told = 0
-        self._said = hashlib.sha256()
 
     def add(self, message: Message) -> None:
         """Take one message in."""
@@ -125,21 +119,7 @@ class Track:
         )
         self._log, self._header, self._index = array("q"), array("q"), array("q")
         self._values, self._samples = array("d"), []
-        self._remember(gathered)
         return gathered
-
-    @property
-    def imprint(self) -> str:
-        """Of what was taken since the demonstration began: times to the microsecond since its start, numbers, images."""
-        return self._said.hexdigest()
-
-    def _remember(self, gathered: TopicSamples) -> None:
-        images = [sample.checksum for sample in gathered.samples]
-        self.n_heard += len(gathered.log_ns)
-        self.n_told += len(gathered.rows) + len(images)
-        since_us = (gathered.log_ns - self._origin_ns + 500) // 1000
-        for values in (since_us, gathered.rows, np.array(images, np.int64)):
-            self._said.update(values.tobytes())
 
     def _look_at_first(self, message: Message) -> None:
         self.camera = is_camera(message)

@@ -250,7 +250,7 @@ def _say_ingested(root: Path, report: IngestReport, *, revives: bool, tagged: Se
         print(f"  replaced, since their log or their range changed: {', '.join(report.replaced)}")
     if report.restated:
         print(
-            f"  told otherwise by their log or the task now, their labels brought up to date: {', '.join(report.restated)}"
+            f"  told otherwise by their log or the task now, their labels and names brought up to date: {', '.join(report.restated)}"
         )
     if report.passed_over:
         print(f"  passed over, recordings left open and links that lead nowhere: {', '.join(report.passed_over)}")

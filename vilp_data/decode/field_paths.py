@@ -20,6 +20,7 @@ from vilp_data.errors import DecodeError, nearest, some_of
 from vilp_data.types import Message
 
 _STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)(?::(\d+))?\]")
+_RANGE = re.compile(r"(.*)\[(\d+):(\d+)\]", re.DOTALL)
 WHOLE = "msg"
 SHOWN_PATHS = 24
 
@@ -54,11 +55,18 @@ def parse_path(path: str) -> tuple[Step, ...]:
 
 def follow(message: Message, path: str) -> Any:
     """What lies at `path` in a message. DecodeError where the path leads nowhere: it says what is there."""
-    value, steps = message.body, parse_path(path)
+    return trail(message, path)[1][-1]
+
+
+def trail(message: Message, path: str) -> tuple[tuple[Step, ...], list[Any]]:
+    """The steps that a path takes in a message, without `msg.` and from its body on; what the first is taken in, and what each leads to.
+    DecodeError as `follow`."""
+    steps, value = parse_path(path), message.body
     if steps and steps[0] == Member(WHOLE) and WHOLE not in member_names(value):
         steps = steps[1:]
     if steps and not isinstance(steps[0], Member) and not isinstance(value, np.ndarray):
-        value = bare_array(message)
+        steps = (*_only_field(message), *steps)
+    values = [value]
     for step in steps:
         if isinstance(step, Member):
             try:
@@ -67,7 +75,20 @@ def follow(message: Message, path: str) -> Any:
                 raise _no_member(message, path, step.name, value) from None
         else:
             value = _item(message, path, value, step)
-    return value
+        values.append(value)
+    return steps, values
+
+
+def range_of(path: str) -> tuple[str, range] | None:
+    """What a path that ends in a range of items leads through ("position" of "position[0:7]"), and the range; None for another path."""
+    match = _RANGE.fullmatch(path)
+    return (match.group(1), range(int(match.group(2)), int(match.group(3)))) if match else None
+
+
+def n_stated(path: str) -> int:
+    """How many numbers a path seems to lead to, as far as its text tells: those of its range, else one."""
+    found = range_of(path)
+    return len(found[1]) if found else 1
 
 
 def fields_here(message: Message) -> str:
@@ -84,11 +105,11 @@ def _no_member(message: Message, path: str, name: str, value: Any) -> DecodeErro
     return cannot_decode(message, f"field {path!r}: no {name!r}", None, remedy)
 
 
-def bare_array(message: Message) -> Any:
-    """What "[0:2]" indexes in a message that is no array: the only field that its schema's vector is made of, as of the std_msgs
-    arrays; else the message itself, which has no items."""
+def _only_field(message: Message) -> tuple[Step, ...]:
+    """The steps to what "[0:2]" indexes in a message that is no array: the only field that its schema's vector is made of, as of the
+    std_msgs arrays; none where it has no such field, and nothing in it has items."""
     fields = usual_fields(message.schema) or ()
-    return follow(message, fields[0]) if len(fields) == 1 else message.body
+    return parse_path(fields[0]) if len(fields) == 1 else ()
 
 
 def _item(message: Message, path: str, value: Any, step: int | slice) -> Any:

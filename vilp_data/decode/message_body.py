@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -22,15 +22,17 @@ def require_member(value: Any, name: str) -> Any:
     """A member by name; of a list of messages (foxglove.JointStates), that member of each. AttributeError or KeyError if absent."""
     if isinstance(value, dict):
         return value[name]
-    if _holds_items(type(value)):  # type: ignore[arg-type]
+    if holds_items(type(value)):
         return [require_member(item, name) for item in value]
     return getattr(value, name)
 
 
-@cache
 def _holds_items(kind: type) -> bool:
-    """Whether a type is a list of things; asked once a type, for asking an abstract class costs more than the rest of a path."""
     return issubclass(kind, Sequence) and not issubclass(kind, str | bytes)
+
+
+holds_items: Callable[[type[Any]], bool] = cache(_holds_items)  # type: ignore[assignment]
+"""Whether a type is a list of things; asked once a type, for asking an abstract class costs more than the rest of a path."""
 
 
 def first_member(value: Any, names: Iterable[str]) -> Any:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from vilp_data.decode.message_body import member_names, set_members
 from vilp_data.decode.usual_fields import PARTS_OF
+from vilp_data.short_names import clean_name
 from vilp_data.types import F64, Message
 
 LARGEST_VECTOR = 32
@@ -41,7 +42,8 @@ def numeric_series(message: Message, names: Sequence[str] = ()) -> Series:
     same length, else by index. Lists of messages (foxglove.JointStates, transforms) name their items by their own name."""
     series: Series = {}
     body = message.body
-    for path, value in _list_leaves(body, (), names) if isinstance(body, np.ndarray) else _leaves(body, ()):
+    named = [clean_name(name) for name in names]
+    for path, value in _list_leaves(body, (), named) if isinstance(body, np.ndarray) else _leaves(body, ()):
         group, name = ".".join(path[:-1]), path[-1]
         series.setdefault(group, {})[name] = value
     return series
@@ -102,9 +104,8 @@ def _list_leaves(values: Any, path: tuple[str, ...], names: Sequence[str]) -> It
         return
     numbers = _numbers(values)
     if numbers is not None:
-        labels = (
-            names if len(set(names)) == len(names) == len(numbers) else [str(index) for index in range(len(numbers))]
-        )
+        places = [str(index) for index in range(len(numbers))]
+        labels = names if len(set(names)) == len(names) == len(numbers) and all(names) else places
         yield from (((*path, label), number) for label, number in zip(labels, numbers, strict=True))
         return
     for index, item in enumerate(values):
@@ -127,9 +128,10 @@ def is_list(value: Any) -> bool:
 
 
 def _texts(value: Any) -> Sequence[str]:
-    return [str(text) for text in value] if value is not None and is_list(value) else ()
+    return [clean_name(str(text)) for text in value] if value is not None and is_list(value) else ()
 
 
 def _item_name(item: Any) -> str | None:
     fields = dict(set_members(item))
-    return next((str(fields[name]) for name in ITEM_NAMES if isinstance(fields.get(name), str) and fields[name]), None)
+    told = (clean_name(fields[name]) for name in ITEM_NAMES if isinstance(fields.get(name), str))
+    return next((name for name in told if name), None)

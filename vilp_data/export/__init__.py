@@ -17,6 +17,7 @@ from vilp_data.export.folder import MANIFEST, out_folder, require_free
 from vilp_data.export.job import ExportJob, Images, ViewWritten, Written
 from vilp_data.export.segments import Choice, Segment, choose, common_rate_hz, common_shapes
 from vilp_data.spec import TaskSpec
+from vilp_data.vector_parts import names_that_differ
 
 __all__ = ["FORMATS", "Choice", "ExportReport", "Format", "export_dataset"]
 
@@ -209,6 +210,7 @@ def _notes(job: ExportJob) -> list[str]:
         notes.append("no split was drawn: every episode counts as training")
     elif without := len(job.chosen.on(None)):
         notes.append(f"episodes on neither side of the split: {without}")
+    notes += names_that_differ(segment.entry.column_names for segment in job.chosen.segments)
     if job.chosen.unlabelled:
         notes.append(f"episodes without actions, theirs are NaN: {len(job.chosen.unlabelled)}")
     if job.shapes.action is None:

@@ -7,7 +7,6 @@ compared with the table: an index that lacks rows would otherwise be a shorter b
 from __future__ import annotations
 
 import sqlite3
-import struct
 from array import array
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from vilp_data.sources.channels import WHOLE_FILE, Channel, Channels, RawMessage
 from vilp_data.sources.folder_hash import file_sha256
 from vilp_data.sources.message_decoders import BEFORE_DEFINITIONS
 from vilp_data.sources.rosbag2_metadata import missing_from_file
+from vilp_data.sources.sqlite_pages import HEAD_SIZE, file_head
 from vilp_data.types import I64, LogEpisode, Message, TopicInfo
 
 MAGIC = b"SQLite format 3\0"
@@ -135,15 +135,14 @@ class Db3Log(SerialisedLog):
         """LogError where the file is shorter than its header says, or its last messages are in a file beside it."""
         size = self._file.stat().st_size
         with self._file.open("rb") as stream:
-            head = stream.read(100)
-        if len(head) < 100:
+            start = stream.read(HEAD_SIZE)
+        if len(start) < HEAD_SIZE:
             raise LogError(
                 "the bag is cut off", where=self.path, found=f"{size} bytes", remedy=copy_or_salvage(self.path)
             )
-        (page_size,) = struct.unpack_from(">H", head, 16)
-        change, pages, pages_valid_for = (struct.unpack_from(">I", head, place)[0] for place in (24, 28, 92))
-        expected = (65536 if page_size == 1 else page_size) * pages
-        if change == pages_valid_for and size < expected:
+        head = file_head(start)
+        expected = head.page_size * head.pages if head else 0
+        if size < expected:
             raise LogError(
                 "the bag is cut off",
                 where=self.path,

@@ -3,10 +3,9 @@
 The file is copied first, with the journal beside it: opening it there lets SQLite finish or roll back what the recorder had begun,
 and leaves the bag as it was.
 
-Rows are read from the table itself, from both ends towards the damage, and then around it; never through the index of times, which
-may lack some. Whether the table has all its rows, SQLite's own check of its trees says. Where anything is damaged, every page is looked
-through for rows that no tree leads to (`sqlite_pages`). Of a file that is cut off, SQLite is asked for the descriptions alone, and the
-pages give the messages: where a page is missing SQLite may answer with zeros, and it cannot tell which rows are not all there.
+Where SQLite's own check finds nothing wrong it gives the rows, from the table itself, never through the index of times. Where anything is
+damaged, or the file is cut off, SQLite is asked for the descriptions alone, and every page is looked through for rows (`sqlite_pages`):
+where a page is missing SQLite may answer with zeros, and it cannot tell which rows are not all there.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import os
 import shutil
 import sqlite3
 import tempfile
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -25,47 +23,21 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from vilp_data import limits
-from vilp_data.errors import LogError
+from vilp_data.errors import LogError, number_of
 from vilp_data.salvage_report import SalvageReport
 from vilp_data.sources.file_bytes import FileBytes
 from vilp_data.sources.mcap_clean import CleanMcap
 from vilp_data.sources.mcap_records import MESSAGE_HEAD
 from vilp_data.sources.message_decoders import BEFORE_DEFINITIONS, stock_definition
-from vilp_data.sources.sqlite_pages import HEAD_SIZE, file_head, message_rows
+from vilp_data.sources.sqlite_pages import HEAD_SIZE, MessagePages, MessageRow, file_head
 
 JOURNALS = ("-wal", "-journal")
-PROBES = 2000  # queries spent on damaged parts of the table
-STEP, STEP_BYTES = 1000, 1 << 24  # rows that are turned around at a time, and their bytes
-LOWEST, HIGHEST = -(1 << 63), (1 << 63) - 1  # of SQLite's row ids
+LOWEST = -(1 << 63)  # of SQLite's row ids
 INSTRUCTIONS = 1_000_000  # of SQLite's machine, between two looks at how much it has done
 TOTAL = 10  # of those per byte of the file: a row takes some 20 and is seen a few times, a tree that leads in circles takes any number
 BROKEN = (sqlite3.Error, OverflowError, MemoryError, ValueError)
 # The table itself, in order of its rows: `id` would be another column if the text that declares it were damaged.
-_ROWS = (
-    "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED WHERE rowid BETWEEN ? AND ? ORDER BY rowid {}"
-)
-
-
-class RowRanges:
-    """Row ids met so far, as ranges of consecutive ones: one for a table that lacks none."""
-
-    def __init__(self) -> None:
-        self._ranges: list[tuple[int, int]] = []  # sorted, disjoint: first and last
-
-    def add(self, number: int) -> bool:
-        """Note a row id; whether it is new."""
-        place = bisect_right(self._ranges, (number, HIGHEST))
-        first, last = self._ranges[place - 1] if place else (number, number - 2)
-        if number <= last:
-            return False
-        begin = place - 1 if number == last + 1 else place
-        after = place < len(self._ranges) and self._ranges[place][0] == number + 1
-        joined = (first if begin < place else number, self._ranges[place][1] if after else number)
-        self._ranges[begin : place + after] = [joined]
-        return True
-
-    def __len__(self) -> int:
-        return len(self._ranges)
+_ROWS = "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY rowid"
 
 
 class Db3Salvage:
@@ -77,8 +49,10 @@ class Db3Salvage:
         self._report = report
         self._channels: dict[int, int] = {}
         self._unknown: Counter[int] = Counter()
-        self._seen = RowRanges()
-        self._probes = 0
+        self._roots: dict[str, int] = {}  # of the tables' trees
+        self._reached = LOWEST - 1  # the last row that SQLite gave
+        self._last: MessageRow | None = None  # that was taken from a page
+        self._unlike = self._unled = 0
         self._damaged = self._cut_off = False
         self._beside: list[str] = []  # suffixes of the journals
         self._bytes = source.size  # and those of the journals beside it, which may add as many to the file
@@ -95,10 +69,9 @@ class Db3Salvage:
                     database.execute("PRAGMA writable_schema = ON")
                 self._set_budget(database)
                 self._describe(database)
-                if not self._cut_off:
-                    self._read(database)
+                if not self._cut_off and self._is_sound(database):
                     self._set_budget(database)
-                    self._check(database)
+                    self._read(database)
             self._note_journals(copy)
             if self._damaged:
                 self._read_pages(copy)
@@ -173,6 +146,9 @@ class Db3Salvage:
             schema = Schema(id=number + 1, name=name, encoding=encoding, data=text.encode())
             channel = Channel(id=number, topic=topic, message_encoding=serialization, metadata={}, schema_id=number + 1)
             self._channels[number] = self._clean.describe(channel, schema)
+        for table, root in self._some(database, "SELECT name, rootpage FROM sqlite_master WHERE type = 'table'"):
+            if isinstance(table, str) and isinstance(root, int):
+                self._roots[table] = root
 
     def _some(self, database: sqlite3.Connection, query: str, *, needed: bool = False) -> Iterator[tuple[Any, ...]]:
         """The rows of a small table up to damage."""
@@ -185,78 +161,75 @@ class Db3Salvage:
 
     # --- messages
 
+    def _is_sound(self, database: sqlite3.Connection) -> bool:
+        """Whether SQLite's own check finds nothing wrong with the file's trees: else rows may be missing that no query misses."""
+        try:
+            found = str(database.execute("PRAGMA integrity_check(1)").fetchone()[0]).removeprefix(
+                "*** in database main ***"
+            )
+        except BROKEN as error:
+            found = str(error)
+        if found != "ok":
+            self._damaged = True
+            self._report.doubt(f"SQLite's check of the file fails ({' '.join(found.split())})")
+        return found == "ok"
+
     def _read(self, database: sqlite3.Connection) -> None:
-        reached = self._forward(database, LOWEST, HIGHEST)
-        if reached is None:
-            return
-        back = self._backward(database, reached, HIGHEST)
-        if back is None:
-            return
-        pending = [(reached + 1, min(back - 1, self._highest(database)))]
-        while pending and self._probes < PROBES:
-            first, last = pending.pop()
-            if first > last or (reached := self._forward(database, first, last)) is None:
-                continue
-            back = self._backward(database, reached, last)
-            if back is not None and reached + 1 < back - 1:  # a single row that neither way reaches is given up
-                middle = (reached + back) // 2
-                pending += [(middle + 1, back - 1), (reached + 1, middle)]
-
-    def _highest(self, database: sqlite3.Connection) -> int:
-        """The highest row id there may be, where the end of the table cannot be read: as the index of times says, or as there is room
-        for: recorders count from 1."""
-        highest = self._bytes
         try:
-            (row,) = database.execute("SELECT MAX(rowid) FROM messages INDEXED BY timestamp_idx").fetchall()
-            highest = max(highest, row[0] or 0)
-        except BROKEN:
-            pass
-        return highest
-
-    def _forward(self, database: sqlite3.Connection, first: int, last: int) -> int | None:
-        """Read rows from `first` up; the last id before damage, or None where `last` was reached."""
-        reached = first - 1
-        self._probes += 1
-        try:
-            for row in database.execute(_ROWS.format("ASC"), (first, last)):
-                reached = row[0]
-                self._take(*row)
+            for row in database.execute(_ROWS):
+                self._reached = row[0]
+                self._take(*row[1:])
         except BROKEN as error:
             self._note_damage(error)
-            return reached
-        return None
 
-    def _backward(self, database: sqlite3.Connection, reached: int, last: int) -> int | None:
-        """Read rows from `last` down to those above `reached`; the last id before damage (`last` + 1 for none), or None where all
-        were read."""
-        back, held = last + 1, 0
-        self._probes += 1
-        rows: list[tuple[Any, ...]] = []
-        try:
-            for row in database.execute(_ROWS.format("DESC"), (reached + 1, last)) if reached < last else ():
-                back = row[0]
-                rows.append(row)
-                held += len(row[3]) if isinstance(row[3], bytes) else 0
-                if len(rows) >= STEP or held >= STEP_BYTES:
-                    self._take_all(rows)
-                    held = 0
-        except BROKEN as error:
-            self._note_damage(error)
-            self._take_all(rows)
-            return back
-        self._take_all(rows)
-        return None
+    def _read_pages(self, copy: Path) -> None:
+        """Take the rows in the copy's pages that SQLite did not give."""
+        # A journal may put pages anywhere behind a cut, with a hole before them that takes no bytes of the disk, but time.
+        size, most = copy.stat().st_size, self._bytes + limits.RECORD_BYTES
+        if size > most:
+            size = most
+            self._report.doubt("a journal's pages far behind the cut were not looked at (VILP_MAX_RECORD_BYTES)")
+        own = self._roots.pop("messages", 0)
+        others = self._roots.values() if own else ()  # the messages' may be one of them, under a name that is damaged
+        with copy.open("rb") as stream:
+            pages = MessagePages(
+                stream, size, whole=self._source.size, largest=limits.RECORD_BYTES, own=own, others=others
+            )
+            for row in pages.rows():
+                if row.number > self._reached:
+                    self._take_once(row)
+        if self._unled:
+            self._report.doubt(
+                f"{number_of(self._unled, 'message')} in pages that the table of messages no longer leads to: deleted ones"
+                " and another table's rows may be among them"
+            )
+        if self._unlike:
+            self._report.doubt(f"{number_of(self._unlike, 'row')} under the id of another one that is unlike it")
+        if pages.left_out:
+            self._report.doubt(
+                f"{number_of(pages.left_out, 'row')} left out, whose ids do not fit the rows beside them"
+            )
 
-    def _take_all(self, rows: list[tuple[Any, ...]]) -> None:
-        for row in reversed(rows):
-            self._take(*row)
-        rows.clear()
+    def _take_once(self, row: MessageRow) -> None:
+        """Take a row of a page, where it is none again. Of two unlike ones under one id the second is no message if the tree leads to
+        the first alone; else nothing tells which is."""
+        if row.topic_id not in self._channels:
+            self._unknown[row.topic_id] += 1
+            return
+        last = self._last
+        if last is not None and last.number == row.number:
+            if last[:-1] == row[:-1]:
+                return
+            self._unlike += 1
+            if last.led_to and not row.led_to:
+                return
+        self._last = row
+        self._unled += not row.led_to
+        self._take(row.topic_id, row.time_ns, row.data)
 
-    def _take(self, number: int, topic_id: Any, time_ns: Any, data: Any) -> None:
+    def _take(self, topic_id: Any, time_ns: Any, data: Any) -> None:
         if not isinstance(time_ns, int) or not isinstance(data, bytes) or not isinstance(topic_id, int) or time_ns < 0:
             self._note_damage(ValueError("a row that is no message"))
-            return
-        if not self._seen.add(number):
             return
         if topic_id not in self._channels:
             self._unknown[topic_id] += 1
@@ -268,40 +241,13 @@ class Db3Salvage:
         topic.unverified += 1
         self._clean.message(channel_id, MESSAGE_HEAD.pack(channel_id, 0, time_ns, time_ns) + data)
 
-    def _read_pages(self, copy: Path) -> None:
-        """Take the rows that are in the copy's pages and were not met yet."""
-        before = self._report.recovered
-        # A journal may put pages anywhere behind a cut, with a hole before them that takes no bytes of the disk, but time.
-        size, most = copy.stat().st_size, self._bytes + limits.RECORD_BYTES
-        if size > most:
-            size = most
-            self._report.doubt("a journal's pages far behind the cut were not looked at (VILP_MAX_RECORD_BYTES)")
-        with copy.open("rb") as stream:
-            for row in message_rows(stream, size, whole=self._source.size, largest=limits.RECORD_BYTES):
-                self._take(*row)
-        found = self._report.recovered - before
-        if found and not self._cut_off:
-            self._report.doubt(f"{found:,} messages lie in pages that no table leads to any more")
-
-    def _check(self, database: sqlite3.Connection) -> None:
-        """Doubt everything where SQLite's own check finds the file's trees damaged: rows may be missing that no query misses."""
-        try:
-            found = str(database.execute("PRAGMA integrity_check(1)").fetchone()[0]).removeprefix(
-                "*** in database main ***"
-            )
-        except BROKEN as error:
-            found = str(error)
-        if found != "ok":
-            self._damaged = True
-            self._report.doubt(f"SQLite's check of the file fails ({' '.join(found.split())})")
-
     def _note_damage(self, error: BaseException) -> None:
         self._damaged = True
         self._report.doubt(f"SQLite cannot read all of it ({error})")
 
     def _conclude(self) -> None:
         report = self._report
-        if not self._channels and not self._seen:
+        if not self._channels and not self._unknown:
             found = "; ".join(report.doubts) or "no topics"
             raise LogError(
                 "no bag of ROS 2, or too damaged", where=self._source.path, found=found, remedy="look for another copy"

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from vilp_data.errors import LogError, copy_again, reason
+from vilp_data.short_names import clean_name
 from vilp_data.sources.row_clock import is_rate
 
 RECOPY = copy_again("folder meta/")
@@ -135,7 +136,7 @@ def _feature(name: str, table: Mapping[str, Any]) -> Feature:
 def _flat_names(names: Any) -> Iterator[str]:
     """Names as the versions write them: a list, a list in a list, or a dict of lists."""
     if isinstance(names, str):
-        yield names
+        yield clean_name(names)
     for inner in names.values() if isinstance(names, dict) else names if isinstance(names, list) else ():
         yield from _flat_names(inner)
 

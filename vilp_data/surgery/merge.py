@@ -22,6 +22,7 @@ from vilp_data.keys import first_difference
 from vilp_data.latents import latents_path
 from vilp_data.removed import read_removed
 from vilp_data.types import RATE_TOLERANCE
+from vilp_data.vector_parts import names_that_differ
 from vilp_data.writer_lock import writer_lock
 
 
@@ -56,6 +57,7 @@ def merge_datasets(other: Path, into: Path) -> MergeReport:
         _refuse_what_does_not_fit(there, here, theirs, ours)
         report = MergeReport()
         wanted = _what_is_new(here, theirs, ours, report)
+        report.notes += names_that_differ(entry.column_names for entry in (*ours, *wanted.values()))
         changes = Changes()
         for id, entry in wanted.items():
             _stage_episode(there, into, id, entry, changes)
@@ -96,6 +98,7 @@ def _told_apart(theirs: EpisodeEntry, ours: EpisodeEntry) -> Iterator[str]:
     """What the other dataset says of the same episode, and this one does not."""
     words = ["trimmed to other steps"] * (theirs.key != ours.key and theirs.ingest_key == ours.ingest_key)
     words += ["labelled otherwise"] * ((theirs.tags, theirs.outcome) != (ours.tags, ours.outcome))
+    words += ["its numbers named otherwise"] * any(names_that_differ([theirs.column_names, ours.column_names]))
     if words:
         yield f"{ours.id}: {' and '.join(words)} there; it stays as it is here"
 
