@@ -72,6 +72,30 @@ def test_the_list_proves_every_set_again_and_ends_with_1_where_one_does_not_hold
     said()
 
 
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"{", "not JSON: "),
+        (b"\xff", "not JSON: "),
+        (b"[]", "a list, not a table"),
+        (b'{"format": 1}', "it lacks 'name'"),
+        (b'{"format": 9}', "format 9, this is 1"),
+    ],
+)
+def test_a_lock_that_cannot_be_read_hides_no_other(recipe: str, content: bytes, words: str) -> None:
+    said("--recipe", recipe)
+    set_path(Path(), "broken").write_bytes(content)
+    text = said(ends=1)
+    assert "mine: 3 episodes give labels" in text
+    assert f"broken: cannot be read\n  {set_path(Path(), 'broken')}: not the lock of an action set" in text
+    assert f"found: {words}" in text
+    assert "Error(" not in text
+    assert "`vilp-data actions --recipe broken --redraw`" in text
+    table = json.loads(said("--json", ends=1))
+    assert table["mine"]["wrong"] == []
+    assert (table["broken"]["key"], len(table["broken"]["wrong"])) == (None, 1)
+
+
 def test_a_name_means_a_recipe_of_the_datasets_task_or_of_the_one_named(recipe: str) -> None:
     result = CliRunner().invoke(app, ["actions", "--data", ".", "--recipe", "small"])
     assert isinstance(result.exception, SpecError)

@@ -100,7 +100,7 @@ def test_locking_again_writes_the_same_bytes_and_reading_gives_them_back(root: P
     before = set_path(root, "hybrid").read_bytes()
     assert locked(root).to_json() == lock.to_json()
     assert set_path(root, "hybrid").read_bytes() == before == lock.to_json()
-    assert ActionSetLock.from_json(before, where="x").to_json() == before
+    assert ActionSetLock.from_json(before, name="hybrid", where="x").to_json() == before
     assert set_names(root) == ["hybrid"]
     set_path(root, "hybrid").unlink()
     locked(root)
@@ -241,6 +241,16 @@ def test_a_set_that_does_not_hold_is_refused_wherever_it_is_read(
         assert str(set_path(root, "hybrid")) in str(refused.value)
         assert "vilp-data actions --recipe hybrid --redraw" in str(refused.value)
     assert check_set(root, "hybrid")
+
+
+def test_remove_names_the_sets_that_it_breaks_and_no_others(root: Path) -> None:
+    lock = lock_action_set(root, "mine", recipe(), given="mine.toml")
+    set_path(root, "broken").write_text("{")
+    labelled, video_only = sorted(lock.episodes)[0], lock.video_only[0]
+    assert remove_episodes(root, [video_only]).notes == []
+    (note,) = remove_episodes(root, [labelled]).notes
+    assert note.startswith(f"the action set 'mine' no longer holds: {labelled} gave it labels; `vilp-data undo`, or ")
+    assert "`vilp-data actions --recipe mine.toml --redraw`" in note
 
 
 def test_another_recipe_of_the_same_name_is_refused_until_it_is_wanted(root: Path) -> None:

@@ -120,6 +120,13 @@ def test_no_episode_with_actions_says_so(tmp_path: Path) -> None:
         opened(tmp_path, "val")
 
 
+def test_tags_that_no_episode_with_actions_has_are_not_blamed_on_the_logs(root: Path) -> None:
+    with pytest.raises(StoreError, match=r"and goal = moon(.|\n)*-> ask for other tags, or none$"):
+        opened(root, where={"goal": "moon"})
+    with pytest.raises(StoreError, match=r"-> ask for other tags, or none, or draw .*`vilp-data split --redraw`$"):
+        opened(root, "val", where={"goal": "moon"})
+
+
 def test_a_stride_longer_than_every_episode_is_refused(root: Path) -> None:
     with pytest.raises(StoreError, match=r"at most 20 steps(.|\n)*frame_stride"):
         opened(root, frame_stride=20)

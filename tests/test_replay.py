@@ -62,6 +62,20 @@ def test_replay_gives_states_back_with_the_tagged_seed_and_angles_that_wrap(inte
     assert not report.proves(10.0)  # a tolerance that one step off would meet proves nothing
 
 
+def test_an_episode_that_cannot_show_a_shift_neither_proves_nor_fails(integrated):
+    """One step whose next action is the same: played a step early it is the same step."""
+    short = replace(integrated, action=np.ones((2, 1), np.float32), state=integrated.state[:2])
+    report = replay(short, Integrator())
+    assert not report.proves(1e-6)
+    assert not report.fails(1e-6)
+    [line] = [line for line in format_replay(report, tolerance=1e-6) if "replayed" in line]
+    assert "1 step replayed" in line
+    assert "(within 1e-06, but too alike to tell a step's shift)" in line
+    wrong = replay(replace(short, state=short.state * [[1.0], [2.0]]), Integrator())
+    assert wrong.fails(1e-6)
+    assert "NOT within 1e-06" in format_replay(wrong, tolerance=1e-6)[0]
+
+
 def test_replay_reports_progress_through_both_plays(integrated):
     told = []
     replay(integrated, Integrator(), progress=lambda done, total: told.append((done, total)))

@@ -116,12 +116,14 @@ class ActionSetLock:
         }
 
     @classmethod
-    def from_json(cls, data: bytes, *, where: object) -> ActionSetLock:
-        """Read a lock back. ActionSetError where it is no lock, of another format version, or lacks a key.
+    def from_json(cls, data: bytes, *, name: str, where: object) -> ActionSetLock:
+        """Read the lock of the set `name` back. ActionSetError where it is no lock, of another format version, or lacks a key.
 
         One that was changed by hand is read as it stands: `check_action_set` tells."""
         try:
             table = json.loads(data)
+            if not isinstance(table, dict):
+                raise TypeError(f"a {type(table).__name__}, not a table")
             if table["format"] != LOCK_FORMAT:
                 raise ValueError(f"format {table['format']!r}, this is {LOCK_FORMAT}")
             return cls(
@@ -139,12 +141,19 @@ class ActionSetLock:
                 seal=str(table["seal"]),
             )
         except (KeyError, TypeError, ValueError, AttributeError, SpecError, StoreError) as error:
-            remedy = (
-                "restore the file from a backup, or choose the set anew with `vilp-data actions --recipe … --redraw`"
-            )
+            remedy = f"restore the file from a backup, or choose the set anew with `vilp-data actions --recipe {name} --redraw`"
             raise ActionSetError(
-                "not the lock of an action set that can be read", where=where, found=repr(error), remedy=remedy
+                "not the lock of an action set that can be read",
+                where=where,
+                found=_unread(error),
+                remedy=f"{remedy} ({name}.toml, where it was chosen by a file)",
             ) from error
+
+
+def _unread(error: Exception) -> str:
+    if isinstance(error, json.JSONDecodeError | UnicodeDecodeError):
+        return f"not JSON: {error}"
+    return f"it lacks {error}" if isinstance(error, KeyError) else str(error)
 
 
 def check_action_set(

@@ -186,7 +186,10 @@ def _too_few(
     found += f"; {mute} more have no actions" if mute else ""
     found += f"; {taken} more are in a source before" if taken else ""
     wanted = f"{source.count} episodes" if source.count else "one episode"
-    remedy = "record or ingest more (validation episodes give no labels), or write a recipe with another count: --recipe FILE.toml"
+    remedy = "record or ingest more (validation episodes give no labels)"
+    if source.count:
+        remedy += ", take a preset that asks for fewer (--preset tiny)"
+    remedy += ", or write a recipe with another count: --recipe FILE.toml"
     return ActionSetError(f"source {name!r}: there are too few for {wanted}", where=where, found=found, remedy=remedy)
 
 

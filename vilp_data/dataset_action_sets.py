@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Collection
 from importlib import resources
 from pathlib import Path
 
@@ -11,7 +13,7 @@ from vilp_data.action_sets import ActionRecipe, Candidate, choose, effective_epo
 from vilp_data.dataset_split import read_split, side_episodes
 from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import ActionSetError, SpecError, UsageError, nearest
+from vilp_data.errors import ActionSetError, SpecError, UsageError, nearest, some_of
 from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.stats import ChannelStats
 from vilp_data.writer_lock import writer_lock
@@ -98,7 +100,7 @@ def find_action_set(root: Path, name: str) -> ActionSetLock:
         known = set_names(root)
         remedy = f"lock it with `vilp-data actions --recipe {name}`" + (f"; {nearest(name, known)}" if known else "")
         raise UsageError(f"this dataset has no action set called {name!r}", where=root, remedy=remedy)
-    return ActionSetLock.from_json(path.read_bytes(), where=path)
+    return ActionSetLock.from_json(path.read_bytes(), name=name, where=path)
 
 
 def read_action_set(root: Path, name: str) -> LabelledEpisodes:
@@ -118,6 +120,20 @@ def check_set(root: Path, name: str) -> list[ActionSetError]:
     """Everything that is wrong with the set `name` today. Raises as `find_action_set`, and SplitError without a split."""
     lock, entries = find_action_set(root, name), EpisodeStore(root).index()
     return list(check_action_set(lock, read_split(root), entries, where=set_path(root, name)))
+
+
+def broken_by_removal(root: Path, episodes: Collection[str]) -> list[str]:
+    """A sentence for each set that some of `episodes`, which are gone, gave labels to. A lock that cannot be read tells nothing."""
+    notes = []
+    for name in set_names(root):
+        with contextlib.suppress(ActionSetError):
+            lock = find_action_set(root, name)
+            if gone := sorted(lock.episodes.keys() & set(episodes)):
+                again = f"`vilp-data actions --recipe {lock.given} --redraw` and train again"
+                notes.append(
+                    f"the action set {name!r} no longer holds: {some_of(gone, 5)} gave it labels; `vilp-data undo`, or {again}"
+                )
+    return notes
 
 
 def _chosen(root: Path, name: str, recipe: ActionRecipe, given: str) -> ActionSetLock:

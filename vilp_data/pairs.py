@@ -168,6 +168,9 @@ def _acting(store: EpisodeStore, split: Literal["train", "val", "all"], where: M
             "no episode has actions" + "".join(f", and {tag} = {value}" for tag, value in where.items()),
             where=store.root,
             found=among,
-            remedy="ingest logs that hold the topics of the task's [action], or draw the split again with `--redraw`",
+            remedy=(
+                "ask for other tags, or none" if where else "ingest logs that hold the topics of the task's [action]"
+            )
+            + ("" if split == "all" else ", or draw the split again with `vilp-data split --redraw`"),
         )
     return acting

@@ -1,27 +1,34 @@
 """Do other labels help? VILP, the oracle and BC trained on several action sets, each with several seeds, from the same starts.
 
     DATA/runs/policy-PRESET-SET-seedK, bc-PRESET-SET-seedK     what is trained
-    DATA/comparisons/PRESET-SET-SET/POLICY-SET-seedK           a rollout each
-    DATA/comparisons/PRESET-SET-SET/report.json, report.md     all of it, side by side
+    DATA/comparisons/PRESET-SET-SET-SEEDS/POLICY-SET-seedK     a rollout each; stay: the one that learns from nothing
+    DATA/comparisons/PRESET-SET-SET-SEEDS/report.json, report.md
+                                                               all of it, side by side
 
 The planner is one and the same for all: it learns from video alone. What is done already, and was made of what is there today, is kept,
-so that a comparison goes on where it stopped.
+so that a comparison goes on where it stopped, and one of other starts or policies takes nothing away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vilp_data.action_set_lock import DIGITS, ActionSetLock
+from vilp_data.dataset_action_sets import read_action_set
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import UsageError, nearest
+from vilp_data.errors import UsageError, VilpDataError, nearest
 from vilp_data.spec import TaskSpec
+from vilp_models.checkpoint import read_state, run_folder
 from vilp_models.compare_sets_report import COMPARED, SetsReport
 from vilp_models.evaluate import evaluate_policy
+from vilp_models.policies.base import Policy
 from vilp_models.policies.load import FOLLOWS_RECORDINGS, PolicyRequest, load_policy
 from vilp_models.recipe import BcRecipe, PolicyRecipe, VilpRecipe, load_recipe
+from vilp_models.rollout import Progress
 from vilp_models.rollout_folder import find_rollout
 from vilp_models.rollout_report import roll_out_into
 from vilp_models.runs import default_run, find_model_run
@@ -31,6 +38,16 @@ from vilp_models.train import train_bc, train_policy
 from vilp_models.trained import default_device
 
 Told = Callable[[str], None]
+
+Bar = Callable[[str, int], AbstractContextManager[Progress | None]]
+"""(label, steps in all) -> what hears how many are done."""
+
+IMAGINES_OR_FOLLOWS = frozenset({"vilp", "oracle"})
+"""Policies that act by the low-level policy."""
+
+
+def no_bar(label: str, total: int) -> AbstractContextManager[Progress | None]:
+    return nullcontext()
 
 
 @dataclass(frozen=True)
@@ -66,7 +83,9 @@ class SetsComparison:
     @property
     def folder(self) -> Path:
         """Where rollouts and report go."""
-        return self.root / "comparisons" / "-".join([self.preset or "default", *self.sets])
+        return (
+            self.root / "comparisons" / "-".join([self.preset or "default", *self.sets, self.seeds.replace(":", "-")])
+        )
 
     def run(self, kind: str, action_set: str, seed: int) -> Path:
         """Where "policy" or "bc" is trained."""
@@ -74,26 +93,77 @@ class SetsComparison:
         return run.with_name(f"{run.name}-seed{seed}")
 
 
-def compare_sets(comparison: SetsComparison, tell: Told) -> tuple[dict[str, Any], SetsReport]:
-    """Train, judge and roll out whatever is not done yet, then write the report; it as plain data, and as it is shown.
+@dataclass(frozen=True)
+class _Planned:
+    """A rollout as it is to be: of this policy, from these starts (`what` they are, in a word), for this many steps each."""
 
-    `tell` hears a line before each piece of work. Raises what training, `evaluate_policy`, `load_policy` and `roll_out_into` raise."""
-    require_simulator(comparison.spec)
-    needs_policy = {"vilp", "oracle"} & set(comparison.policies)
+    folder: Path
+    name: str
+    acting: Policy
+    starts: Sequence[Start]
+    what: str
+    max_steps: int
+
+    def found(self) -> dict[str, Any] | None:
+        """The report.json of the one that is there; None where there is none, or it is another."""
+        there = find_rollout(self.folder)
+        if there is None:
+            return None
+        made_of = (
+            there["tags"],
+            there.get("n_action_steps"),
+            [e["name"] for e in there["episodes"]],
+            there["max_steps"],
+        )
+        names = [start.name for start in self.starts]
+        return there if made_of == (dict(self.acting.tags), self.acting.n_action_steps, names, self.max_steps) else None
+
+
+def compare_sets(comparison: SetsComparison, tell: Told, bar: Bar = no_bar) -> tuple[dict[str, Any], SetsReport]:
+    """Train, judge and roll out whatever is not done yet, then write the report; it as plain data, and as it is shown. It covers the
+    policies that were rolled out here before, too, while their rollouts are of today's models.
+
+    `tell` hears a line before each piece of work, `bar` shows a rollout's steps. What a user named is proved before the first training.
+    Raises what `read_action_set`, training, `evaluate_policy`, `load_policy` and `roll_out_into` raise."""
+    locks = _require_ready(comparison)
+    asked = [policy for policy in COMPARED if policy in comparison.policies]
     errors: dict[tuple[str, int], dict[str, Any]] = {}
     rollouts: dict[tuple[str, str, int], dict[str, Any]] = {}
+    models = [(action_set, seed) for seed in range(comparison.n_seeds) for action_set in comparison.sets]
+    for action_set, seed in models:
+        if IMAGINES_OR_FOLLOWS & set(asked):
+            errors[action_set, seed] = _low_level(comparison, action_set, seed, tell)
+        if "bc" in asked:
+            _train_bc(comparison, action_set, seed, tell)
     for seed in range(comparison.n_seeds):
-        for action_set in comparison.sets:
-            if needs_policy:
-                errors[action_set, seed] = _low_level(comparison, action_set, seed, tell)
-            if "bc" in comparison.policies:
-                _train_bc(comparison, action_set, seed, tell)
-    for seed in range(comparison.n_seeds):
-        for policy in comparison.policies:
+        for policy in asked:
             for action_set in comparison.sets:
-                rollouts[policy, action_set, seed] = _rollout(comparison, policy, action_set, seed, tell)
-    report = SetsReport(comparison.spec.name, comparison.sets, comparison.n_seeds, errors, rollouts)
+                rollouts[policy, action_set, seed] = _rollout(comparison, policy, action_set, seed, tell, bar)
+    for policy in COMPARED:
+        if policy not in asked:
+            rollouts |= _from_before(comparison, policy, tell)
+    shown = {policy for policy, _, _ in rollouts}
+    if not errors and IMAGINES_OR_FOLLOWS & shown:
+        errors = {model: _held_out(comparison, *model) for model in models}
+    stay = None if shown <= FOLLOWS_RECORDINGS else _rolled_out(_staying(comparison), comparison, "stay", tell, bar)
+    report = SetsReport(
+        comparison.spec.name, comparison.sets, comparison.n_seeds, errors, rollouts,
+        dataset=str(comparison.root), preset=comparison.preset, locks=locks, stay=stay,
+    )  # fmt: skip
     return report.write(comparison.folder), report
+
+
+def _require_ready(comparison: SetsComparison) -> dict[str, ActionSetLock]:
+    """The lock of each set. Raises where one does not hold, where what is trained before the comparison is not there, where the seeds
+    are none, and where the task has no simulator."""
+    require_simulator(comparison.spec)
+    parse_seeds(comparison.seeds)
+    locks = {action_set: read_action_set(comparison.root, action_set).lock for action_set in comparison.sets}
+    if IMAGINES_OR_FOLLOWS & set(comparison.policies):
+        _vqgan(comparison)
+    if "vilp" in comparison.policies:
+        find_model_run(comparison.root, "planner", preset=comparison.preset, option="--preset")
+    return locks
 
 
 def _low_level(comparison: SetsComparison, action_set: str, seed: int, tell: Told) -> dict[str, Any]:
@@ -102,8 +172,14 @@ def _low_level(comparison: SetsComparison, action_set: str, seed: int, tell: Tol
     recipe = load_recipe(PolicyRecipe, "policy", spec.models, preset=comparison.preset, where=spec.name)
     run, vqgan = comparison.run("policy", action_set, seed), _vqgan(comparison)
     tell(f"low-level policy, {action_set}, seed {seed}")
-    train_policy(root, spec, recipe, run, vqgan=vqgan, action_set=action_set)
-    return evaluate_policy(root, spec, run, vqgan, action_set=action_set)[0]
+    restart = _is_of_another_version(comparison, run, action_set, tell)
+    train_policy(root, spec, recipe, run, vqgan=vqgan, action_set=action_set, restart=restart)
+    return _held_out(comparison, action_set, seed)
+
+
+def _held_out(comparison: SetsComparison, action_set: str, seed: int) -> dict[str, Any]:
+    run, spec = comparison.run("policy", action_set, seed), _with_seed(comparison.spec, "policy", seed)
+    return evaluate_policy(comparison.root, spec, run, _vqgan(comparison), action_set=action_set)[0]
 
 
 def _train_bc(comparison: SetsComparison, action_set: str, seed: int, tell: Told) -> None:
@@ -111,11 +187,67 @@ def _train_bc(comparison: SetsComparison, action_set: str, seed: int, tell: Told
     recipe = load_recipe(BcRecipe, "bc", spec.models, preset=comparison.preset, where=spec.name)
     run, n_steps = comparison.run("bc", action_set, seed), _n_action_steps(comparison)
     tell(f"bc, {action_set}, seed {seed}")
-    train_bc(comparison.root, spec, recipe, run, n_action_steps=n_steps, action_set=action_set)
+    restart = _is_of_another_version(comparison, run, action_set, tell)
+    train_bc(comparison.root, spec, recipe, run, n_action_steps=n_steps, action_set=action_set, restart=restart)
 
 
-def _rollout(comparison: SetsComparison, policy: str, action_set: str, seed: int, tell: Told) -> dict[str, Any]:
+def _is_of_another_version(comparison: SetsComparison, run: Path, action_set: str, tell: Told) -> bool:
+    """Whether this run, which is the comparison's own, learnt from the set of this name before it was drawn anew: it can serve nobody
+    any more."""
+    state = read_state(run_folder(run, sorted(comparison.spec.views)))
+    there = None if state is None else state.action_set
+    now = read_action_set(comparison.root, action_set).key
+    if there is None or there["name"] != action_set or there["key"] == now:
+        return False
+    keys = f"{there['key'][:DIGITS]} then, {now[:DIGITS]} now"
+    tell(f"{run.name} learnt from another version of {action_set} ({keys}): it is trained anew")
+    return True
+
+
+def _rollout(
+    comparison: SetsComparison, policy: str, action_set: str, seed: int, tell: Told, bar: Bar = no_bar
+) -> dict[str, Any]:
     """The rollout's report.json: the one that is there, if it is of these models, these starts and this length."""
+    planned = _planned(comparison, policy, action_set, seed)
+    return _rolled_out(planned, comparison, f"{policy}, {action_set}, seed {seed}", tell, bar)
+
+
+def _rolled_out(planned: _Planned, comparison: SetsComparison, label: str, tell: Told, bar: Bar) -> dict[str, Any]:
+    if (there := planned.found()) is None:
+        tell(f"rolling out {label}")
+        with bar(label, len(planned.starts) * planned.max_steps) as progress:
+            roll_out_into(
+                planned.folder, comparison.spec, planned.acting, planned.starts, name=planned.name, what=planned.what,
+                max_steps=planned.max_steps, environments=comparison.environments, with_logs=False, progress=progress,
+            )  # fmt: skip
+        there = find_rollout(planned.folder)
+        assert there is not None
+    return there
+
+
+def _from_before(comparison: SetsComparison, policy: str, tell: Told) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """The rollouts of a policy that was not asked for now, where those of all its models are there and still of today; else none."""
+    models = [(action_set, seed) for seed in range(comparison.n_seeds) for action_set in comparison.sets]
+    if any(find_rollout(_folder(comparison, policy, *model)) is None for model in models):
+        return {}
+    rollouts = {}
+    for model in models:
+        try:
+            there = _planned(comparison, policy, *model).found()
+        except VilpDataError:  # its models are not there any more, or fit nothing of today
+            there = None
+        if there is None:
+            tell(f"{policy} is left out of the report: its rollouts here are of other models or starts than today's")
+            return {}
+        rollouts[(policy, *model)] = there
+    return rollouts
+
+
+def _folder(comparison: SetsComparison, policy: str, action_set: str, seed: int) -> Path:
+    return comparison.folder / f"{policy}-{action_set}-seed{seed}"
+
+
+def _planned(comparison: SetsComparison, policy: str, action_set: str, seed: int) -> _Planned:
     starts, recordings, what = _starts(comparison, policy)
     kind = "bc" if policy == "bc" else "policy"
     request = PolicyRequest(
@@ -123,20 +255,16 @@ def _rollout(comparison: SetsComparison, policy: str, action_set: str, seed: int
         recordings=recordings, vqgan=comparison.vqgan, action_set=action_set,
         runs={kind: comparison.run(kind, action_set, seed)},
     )  # fmt: skip
-    acting = load_policy(policy, request)
-    folder = comparison.folder / f"{policy}-{action_set}-seed{seed}"
+    folder, n_steps = _folder(comparison, policy, action_set, seed), require_simulator(comparison.spec).max_steps
+    return _Planned(folder, policy, load_policy(policy, request), starts, what, n_steps)
+
+
+def _staying(comparison: SetsComparison) -> _Planned:
+    """The policy that does nothing, from the simulator's starts: what VILP and BC have to beat."""
+    starts, _, what = _starts(comparison, "stay")
+    request = PolicyRequest(comparison.root, comparison.spec, comparison.preset, _n_action_steps(comparison))
     n_steps = require_simulator(comparison.spec).max_steps
-    there = find_rollout(folder)
-    made_of = (dict(acting.tags), [start.name for start in starts], n_steps)
-    if there is None or (there["tags"], [e["name"] for e in there["episodes"]], there["max_steps"]) != made_of:
-        tell(f"rolling out {policy}, {action_set}, seed {seed}")
-        roll_out_into(
-            folder, comparison.spec, acting, starts, name=policy, what=what, max_steps=n_steps,
-            environments=comparison.environments, with_logs=False,
-        )  # fmt: skip
-        there = find_rollout(folder)
-        assert there is not None
-    return there
+    return _Planned(comparison.folder / "stay", "stay", load_policy("stay", request), starts, what, n_steps)
 
 
 def _starts(comparison: SetsComparison, policy: str) -> tuple[list[Start], dict[int, Recording], str]:

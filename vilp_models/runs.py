@@ -36,6 +36,11 @@ def find_model_run(
         chosen = {"--preset": preset, "--set": action_set}
         words = "".join(f" {name} {value}" for name, value in chosen.items() if value is not None)
         remedy = f"train it with `vilp-models train {model}{words}`"
+        sets = [
+            path.name.removeprefix(f"{run.name}-") for path in sorted(run.parent.glob(f"{run.name}-*")) if path.is_dir()
+        ]
+        if action_set is None and sets:
+            remedy += f", or take the one of an action set with --set {' or '.join(sets)}"
         if option != "--preset":
             remedy += f", or name another with {option}"
         what = f"no {model} run of preset {preset!r}" + (f" and action set {action_set!r}" if action_set else "")

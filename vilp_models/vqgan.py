@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from diffusers import VQModel
+from pydantic import ValidationError
 from torch import Tensor
 
-from vilp_data.errors import UsageError
+from vilp_data.errors import StoreError, UsageError
 from vilp_data.keys import digest
 from vilp_data.types import F16, F32, I64, U8
 from vilp_models.checkpoint import model_tensors, read_recipe, read_state, run_for_view
@@ -201,8 +202,14 @@ def encoder_digest(model: VQModel) -> str:
 
 
 def load_vqgan(run: Path) -> tuple[VQModel, VqganRecipe]:
-    """The trained network in one run's folder, and its recipe. Raises StoreError where it is missing or damaged."""
-    recipe = VqganRecipe.model_validate(read_recipe(run))
+    """The trained network in one run's folder, and its recipe. Raises StoreError where it is missing or damaged, or was
+    trained with keys or values of a recipe that are none today."""
+    try:
+        recipe = VqganRecipe.model_validate(read_recipe(run))
+    except ValidationError as error:
+        found = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'together'}: {item['msg']}" for item in error.errors())
+        remedy = "train it again with `vilp-models train vqgan --restart`"
+        raise StoreError("a VQGAN's recipe that cannot be used today", where=run, found=found, remedy=remedy) from error
     tensors = model_tensors(run)
     model = build_vqgan(recipe, image_channels=int(tensors["encoder.conv_in.weight"].shape[1]))
     model.load_state_dict({name: torch.from_numpy(array) for name, array in tensors.items()})
@@ -213,10 +220,12 @@ def load_frame_encoder(run_dir: Path, view: str, *, device: str | torch.device |
     """The frame encoder of one view: what the entry-point group `vilp.frame_encoders` names.
 
     `run_dir` is what `train_vqgan` wrote; without a `device` it is an accelerator if there is one. Raises UsageError where no VQGAN
-    there was trained on this view to its end, StoreError where the checkpoint is damaged.
+    there was trained on this view to its end, or the run is another model's, StoreError where the checkpoint is damaged.
     """
     run = run_for_view(run_dir, view)
     state = read_state(run)
+    if state is not None and state.model != "vqgan":
+        raise UsageError("not a vqgan", where=run, found=state.model, remedy="name the run of a vqgan")
     if state is not None and not state.finished:
         found, remedy = f"step {state.step} of {state.steps}", "run `vilp-models train vqgan` again: it goes on there"
         raise UsageError("this network's training is not finished", where=run, found=found, remedy=remedy)

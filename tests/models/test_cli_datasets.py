@@ -18,6 +18,7 @@ from vilp_data.errors import UsageError
 from vilp_data.spec import TaskSpec, load_task
 from vilp_models.cli import app
 from vilp_models.cli.options import dataset_of
+from vilp_models.compare_sets import SetsComparison
 from vilp_models.policies.load import PolicyRequest
 
 MODELS = ("vqgan", "planner", "policy", "bc")
@@ -63,6 +64,7 @@ EXAMPLES = sorted(_examples(typer.main.get_command(app)))
 CALLED = (
     "train.train_vqgan", "train.train_planner", "train.train_policy", "train.train_bc", "fidelity.report_inputs",
     "evaluate.evaluate_planner", "evaluate.evaluate_policy", "evaluate.generate_videos", "policies.load.load_policy",
+    "compare_sets.compare_sets",
 )  # fmt: skip
 
 
@@ -86,7 +88,7 @@ def test_the_examples_of_the_help_find_dataset_preset_and_runs(
         CliRunner().invoke(app, example.split(), catch_exceptions=False)
     given: list[Any] = []
     for value in reached.value.args:
-        given += [value.root, value.spec] if isinstance(value, PolicyRequest) else [value]
+        given += [value.root, value.spec] if isinstance(value, PolicyRequest | SetsComparison) else [value]
     task = "hanoi" if "hanoi" in example else "pusht"
     assert data / task in [value.root if isinstance(value, EpisodeStore) else value for value in given]
     today = load_task(task, preset="cpu")

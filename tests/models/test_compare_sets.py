@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +19,10 @@ pytest.importorskip("gymnasium", reason="the simulators are not installed: make 
 import gymnasium
 from gymnasium.spaces import Box, Dict
 
-from tests.models.conftest import HEIGHT, VIEWS, WIDTH
+from tests.models.conftest import HEIGHT, STEPS, VIEWS, WIDTH
 from tests.models.trained_cards import PRESET, TrainedCards
 from vilp_data.action_sets import recipe_from_dict
-from vilp_data.dataset_action_sets import lock_action_set
+from vilp_data.dataset_action_sets import lock_action_set, read_action_set
 from vilp_data.dataset_split import read_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
@@ -88,7 +90,8 @@ def test_a_comparison_trains_and_rolls_out_each_model_once_and_reports_them_side
         "bc, small, seed 0", "bc, hybrid, seed 0", "bc, small, seed 1", "bc, hybrid, seed 1"
     ]  # fmt: skip
     rolled = {path.name for path in comparison.folder.iterdir() if path.is_dir()}
-    assert rolled == {f"{p}-{s}-seed{k}" for p in ("vilp", "oracle", "bc") for s in ("small", "hybrid") for k in (0, 1)}
+    learnt = {f"{p}-{s}-seed{k}" for p in ("vilp", "oracle", "bc") for s in ("small", "hybrid") for k in (0, 1)}
+    assert rolled == learnt | {"stay"}
     assert json.loads((comparison.folder / "report.json").read_text()) == table
     assert table["policies"]["vilp"]["n_starts"] == 3
     assert table["policies"]["oracle"]["starts"] == "val"
@@ -101,23 +104,75 @@ def test_a_comparison_trains_and_rolls_out_each_model_once_and_reports_them_side
     assert "| vilp, success rate |" in words
     assert "hybrid - small" in words
     assert any(line.startswith("bc, mean of max reward: small ") for line in report.lines())
+    lock = read_action_set(comparison.root, "hybrid").lock
+    assert table["labels"]["hybrid"] == {"episodes": 4, "steps": 4 * STEPS, "key": lock.key}
+    assert f"- hybrid: 4 labelled episodes, {4 * STEPS} steps, `{lock.key[:12]}`" in words
+    assert f"Dataset `{comparison.root}`, preset {PRESET}." in words
+    assert table["stay"]["success"] == {"value": 0.0, "low": 0.0, "high": 0.5615}  # Wilson's, of none of three
+    assert "| stay, success rate | 0.000 (0.000 to 0.561) | 0.000 (0.000 to 0.561) | – |" in words
 
     told.clear()
     again, _ = compare_sets(comparison, told.append)
     assert again == table
     assert not [line for line in told if line.startswith("rolling out")]
 
+    told.clear()
+    of_one_policy, _ = compare_sets(replace(comparison, policies=("bc",)), told.append)
+    assert of_one_policy == table  # what was rolled out before is reported too
+    assert not [line for line in told if not line.startswith("bc, ")]
 
-def test_a_rollout_of_other_starts_is_made_again(comparison: SetsComparison) -> None:
-    bc = replace(comparison, policies=("bc",), n_seeds=1)
-    compare_sets(bc, lambda _: None)
-    told: list[str] = []
-    table, _ = compare_sets(replace(bc, seeds="5:9"), told.append)
+    redraw(comparison, "hybrid")
+    told.clear()
+    after, _ = compare_sets(replace(comparison, policies=("bc",)), told.append)
+    assert list(after["policies"]) == ["bc"]  # the others' models are of the set as it was
+    assert [line.split(" (")[0] for line in told if "another version" in line] == [
+        f"bc-{PRESET}-hybrid-seed{seed} learnt from another version of hybrid" for seed in (0, 1)
+    ]
     assert [line for line in told if line.startswith("rolling out")] == [
-        "rolling out bc, small, seed 0", "rolling out bc, hybrid, seed 0"
+        f"rolling out bc, hybrid, seed {seed}" for seed in (0, 1)
+    ]
+    assert any(line.startswith("vilp is left out of the report") for line in told)
+
+
+def redraw(comparison: SetsComparison, name: str) -> None:
+    recipe = recipe_from_dict({"source": {"purple": {"where": {"object": "purple"}, "count": 1}}}, where="x")
+    lock_action_set(comparison.root, name, recipe, given=name, redraw=True)
+
+
+def test_a_comparison_from_other_starts_leaves_the_earlier_one_alone(comparison: SetsComparison) -> None:
+    bc = replace(comparison, policies=("bc",), n_seeds=1)
+    first, _ = compare_sets(bc, lambda _: None)
+    told: list[str] = []
+    other = replace(bc, seeds="5:9")
+    table, _ = compare_sets(other, told.append)
+    assert [line for line in told if line.startswith("rolling out")] == [
+        "rolling out bc, small, seed 0", "rolling out bc, hybrid, seed 0", "rolling out stay"
     ]  # fmt: skip
     assert table["policies"]["bc"]["n_starts"] == 4
     assert table["low_level_mae"] == {}
+    assert (bc.folder.name, other.folder.name) == (f"{PRESET}-small-hybrid-0-3", f"{PRESET}-small-hybrid-5-9")
+    assert json.loads((bc.folder / "report.json").read_text()) == first
+
+
+def test_every_rollout_tells_its_steps(comparison: SetsComparison) -> None:
+    done: dict[str, tuple[int, int]] = {}
+
+    @contextmanager
+    def bar(label: str, total: int) -> Iterator[Any]:
+        yield lambda step, steps: done.update({label: (step, steps)})
+        assert done[label] == (total, total)
+
+    compare_sets(replace(comparison, policies=("bc",), n_seeds=1), lambda _: None, bar)
+    assert done == dict.fromkeys(("bc, small, seed 0", "bc, hybrid, seed 0", "stay"), (3 * MAX_STEPS, 3 * MAX_STEPS))
+
+
+def test_what_a_comparison_needs_is_proved_before_the_first_training(comparison: SetsComparison) -> None:
+    told: list[str] = []
+    shutil.rmtree(comparison.root / "runs" / f"planner-{PRESET}")
+    for change in ({"sets": ("small", "hybrd")}, {"seeds": "9:3"}, {"policies": ("bc", "vilp")}):
+        with pytest.raises(UsageError):
+            compare_sets(replace(comparison, **change), told.append)
+    assert told == []
 
 
 def rollout(rewards: list[float]) -> Mapping[str, Any]:
@@ -138,6 +193,29 @@ def test_differences_are_paired_by_start_after_seeds_are_averaged() -> None:
     assert gain.value == pytest.approx(0.225)
     assert (gain.low, gain.high) == pytest.approx((0.2, 0.25))
     assert report.value("bc", "hybrid", "success").value == 0.25
+
+
+def test_success_of_one_training_seed_has_an_interval_with_a_width_at_zero() -> None:
+    rollouts = {("bc", name, 0): rollout([0.1, 0.5]) for name in ("small", "hybrid")}
+    success = SetsReport("x", ("small", "hybrid"), 1, {}, rollouts).value("bc", "small", "success")
+    assert success.value == success.low == 0
+    assert success.high == pytest.approx(0.658, abs=1e-3)
+
+
+def test_where_starts_do_not_differ_no_interval_is_claimed_and_the_report_says_so() -> None:
+    rollouts = {
+        ("bc", name, seed): rollout([0.1 + more, 0.5 + more])
+        for name, more in {"small": 0.0, "hybrid": 0.2}.items() for seed in (0, 1)
+    }  # fmt: skip
+    report = SetsReport("x", ("small", "hybrid"), 2, {}, rollouts)
+    gain = report.gain("bc", "hybrid", "max_reward")
+    assert gain.value == pytest.approx(0.2)
+    assert math.isnan(gain.low)
+    assert math.isnan(gain.high)
+    assert report.to_json()["policies"]["bc"]["sets"]["hybrid"]["success"] == {"value": 0.0, "low": None, "high": None}
+    assert report.lines()[0].endswith("hybrid - small +0.200")
+    assert "starts did not differ" in report.lines()[-1]
+    assert "starts did not differ" in report.to_markdown()
 
 
 @pytest.mark.parametrize(("sets", "policies"), [(("small",), ("bc",)), (("small", "hybrid"), ("stay",))])

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium", reason="the simulators are not installed (make setup)")
 
+from vilp_data import sims
 from vilp_data.assemble import assemble_episode
 from vilp_data.errors import UsageError
+from vilp_data.sims import record
 from vilp_data.sims.record import record_task
 from vilp_data.sources import open_log
 from vilp_data.spec import TaskSpec, load_task
@@ -71,4 +76,66 @@ def test_a_simulator_or_expert_that_is_not_there_is_said_to_be_missing(
     other = task.model_copy(update={"sim": task.sim.model_copy(update=changed)})
     with pytest.raises(UsageError, match=said):
         record_task(other, tmp_path / "logs", episodes=1, first_seed=0, workers=1)
+    assert not list(tmp_path.glob("logs/*.mcap"))
+
+
+def test_the_page_makes_a_task_that_is_built_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    environment, expert, _ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    toml, _ = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "reach_dot.py").write_text(environment)
+    (tmp_path / "reach_dot_expert.py").write_text(expert)
+    (tmp_path / "reach_dot.toml").write_text(toml)
+    monkeypatch.setattr(sims, "__path__", [*sims.__path__, str(tmp_path)])
+    [entry_point] = re.findall(r'`"(vilp/ReachDot-v0)": "(.*?)",`', page)
+    [(name, *parts)] = re.findall(r'`"(vilp/ReachDot-v0)": _Recordable\("(.*?)", (\(.*?\)), (\(.*?\))\),`', page)
+    monkeypatch.setitem(sims.ENVIRONMENTS, *entry_point)
+    recordable = record._Recordable(parts[0], *map(ast.literal_eval, parts[1:]))
+    monkeypatch.setitem(record.RECORDABLE, name, recordable)
+    task = load_task(str(tmp_path / "reach_dot.toml"))
+    episodes = record_task(task, tmp_path / "logs", episodes=2, first_seed=1000, workers=1)
+    assert [episode.success for episode in episodes] == [True] * 2
+
+
+def test_no_start_of_the_pages_task_is_a_success_or_a_step_away_from_one(task: TaskSpec) -> None:
+    env = make_env(task, cameras=False).unwrapped
+    for seed in range(200):
+        env.reset(seed=seed)
+        assert np.hypot(*(env.disc - env.dot)) > 8
+
+
+def unfit(change: Callable[[str], str], folder: Path, module: str) -> None:
+    """The page's module under another name, with a mistake in it."""
+    text = (folder / "reach_dot.py").read_text()
+    wrong = change(text.replace("mine/ReachDot-v0", f"{module}/ReachDot-v0").replace("reach_dot:", f"{module}:"))
+    assert wrong != text
+    (folder / f"{module}.py").write_text(wrong)
+
+
+@pytest.mark.parametrize(
+    ("module", "right", "wrong", "said"),
+    [
+        (
+            "typo_in_expert",
+            "gap = self.env.dot",
+            "gap = self.env.dto",
+            r"AttributeError: .*dto.*typo_in_expert\.py:\d+",
+        ),
+        ("typo_in_env", "near = bool(np.", "near = bool(npp.", r"NameError: .*npp.*typo_in_env\.py:\d+"),
+        ("no_hold", '"hold_action": self.disc.astype(np.float32),', "", "info lacks 'hold_action'"),
+        ("no_success", '"is_success": near,', "", "info lacks 'is_success'"),
+        ("no_low_dim", 'seen = {"low_dim": self.disc.astype(np.float32)}', "seen = {}", "observation lacks 'low_dim'"),
+    ],
+)
+def test_a_mistake_in_ones_own_simulator_is_told_with_its_seed_and_place(
+    task: TaskSpec, tmp_path: Path, module: str, right: str, wrong: str, said: str
+) -> None:
+    unfit(
+        lambda text: text.replace(right, wrong).replace('info["is_success"], False', "False, False"), tmp_path, module
+    )
+    assert task.sim is not None
+    own = {"env": f"{module}:{module}/ReachDot-v0", "expert": f"{module}:ReachDotExpert"}
+    other = task.model_copy(update={"sim": task.sim.model_copy(update=own)})
+    with pytest.raises(UsageError, match=rf"seed 1000(.|\n)*{said}"):
+        record_task(other, tmp_path / "logs", episodes=1, first_seed=1000, workers=1)
     assert not list(tmp_path.glob("logs/*.mcap"))

@@ -9,6 +9,7 @@ import typer
 
 from vilp_data.action_set_lock import DIGITS, ActionSetLock, counted
 from vilp_data.cli.options import JsonOption, PresetOption, open_dataset, print_json
+from vilp_data.errors import ActionSetError
 from vilp_data.spec import load_task
 
 
@@ -58,11 +59,20 @@ def actions(
 def _list_sets(root: Path, *, as_json: bool) -> None:
     from vilp_data.dataset_action_sets import check_set, find_action_set, set_names
 
-    found = {name: (find_action_set(root, name), check_set(root, name)) for name in set_names(root)}
+    found: dict[str, tuple[ActionSetLock | None, list[ActionSetError]]] = {}
+    for name in set_names(root):
+        try:
+            found[name] = find_action_set(root, name), check_set(root, name)
+        except ActionSetError as error:
+            found[name] = None, [error]
     if as_json:
         print_json(
             {
-                name: {"key": lock.key, "episodes": sorted(lock.episodes), "wrong": list(map(str, wrong))}
+                name: {
+                    "key": lock.key if lock else None,
+                    "episodes": sorted(lock.episodes) if lock else [],
+                    "wrong": list(map(str, wrong)),
+                }
                 for name, (lock, wrong) in found.items()
             }
         )
@@ -70,7 +80,11 @@ def _list_sets(root: Path, *, as_json: bool) -> None:
         print(f"{root}: no action set yet; `vilp-data actions --recipe small` locks one")
     else:
         for name, (lock, wrong) in found.items():
-            print("\n".join([f"{name}: {_counted(lock)}", *(f"  {error}" for error in wrong)]))
+            print(
+                "\n".join(
+                    [f"{name}: {_counted(lock) if lock else 'cannot be read'}", *(f"  {error}" for error in wrong)]
+                )
+            )
     if any(wrong for _, wrong in found.values()):
         raise typer.Exit(1)
 

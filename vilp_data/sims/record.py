@@ -14,6 +14,7 @@ import importlib.util
 import json
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from vilp_data.engine import cpu_count, map_unordered
-from vilp_data.errors import LogError, UsageError, nearest
+from vilp_data.errors import LogError, UsageError, VilpDataError, nearest
 from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sims import load_entry_point, register
 from vilp_data.sims.episode_log import START_NS, tick_writer
@@ -119,8 +120,8 @@ def record_task(
     environment, those of `variant` (one of `spec.record.variants`) on top; its logs are `<task>-<variant>-seed…` and say so. `workers` 0
     means one process for each core. `progress` hears (done, total) after each; the list returned is in order of seed.
 
-    Raises UsageError where the task has no scripted expert, the simulator is not installed, or a log in `out_dir` was made with
-    other options; SpecError for a variant that it does not have.
+    Raises UsageError where the task has no scripted expert, the simulator is not installed, it or the expert fails (with the seed and
+    the place), or a log in `out_dir` was made with other options; SpecError for a variant that it does not have.
     """
     if spec.sim is None or (spec.sim.expert is None and spec.sim.env not in RECORDABLE):
         env = "no [sim] table" if spec.sim is None else spec.sim.env
@@ -224,10 +225,22 @@ def _make_expert(sim: SimSpec, env: Any, seed: int) -> Expert:
 
 
 def _record_one(job: _Job) -> RecordedEpisode:
-    """Runs in a worker process: the simulator is imported here."""
+    """Runs in a worker process: the simulator is imported here. What goes wrong in someone's own is an error of theirs, with its place."""
+    try:
+        return _played(job)
+    except VilpDataError:
+        raise
+    except Exception as error:
+        found = f"{type(error).__name__}: {error} ({_place(error)})"
+        remedy = "correct it there, and record again: finished logs are kept"
+        raise UsageError("not recorded", where=_where(job), found=found, remedy=remedy) from error
+
+
+def _played(job: _Job) -> RecordedEpisode:
     env = _make_env(job.sim)
     try:
         observation, info = env.reset(seed=job.seed)
+        _refuse_incomplete(job, observation, info)
         expert = _make_expert(job.sim, env, job.seed)
         write = tick_writer(job.spec, env)
         with EpisodeRecorder(job.path, metadata=_tags(job, env, expert), seed=job.seed) as log:
@@ -243,6 +256,32 @@ def _record_one(job: _Job) -> RecordedEpisode:
     finally:
         env.close()
     return RecordedEpisode(job.path, job.seed, bool(info["is_success"]), tick)
+
+
+def _where(job: _Job) -> str:
+    return f"{job.sim.env}, seed {job.seed}"
+
+
+def _place(error: Exception) -> str:
+    """File and line of the innermost frame that is not an installed package's."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "site-packages" not in Path(frame.filename).parts]
+    return f"{own[-1].filename}:{own[-1].lineno}"
+
+
+def _refuse_incomplete(job: _Job, observation: Mapping[str, Any], info: Mapping[str, Any]) -> None:
+    for what, given, needed in (
+        ("observation", observation, ("low_dim",)),
+        ("info", info, ("state", "is_success", "hold_action")),
+    ):
+        for name in needed:
+            if name not in given:
+                raise UsageError(
+                    f"the simulator's {what} lacks {name!r}",
+                    where=_where(job),
+                    found=", ".join(given),
+                    remedy="docs/add_a_task.md says what an environment keeps to",
+                )
 
 
 def _tags(job: _Job, env: Any, expert: Expert) -> dict[str, str]:

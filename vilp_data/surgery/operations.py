@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vilp_data import history, shards
+from vilp_data.dataset_action_sets import broken_by_removal
 from vilp_data.dataset_split import find_split, split_by
 from vilp_data.dataset_state import frames_name, steps_name
 from vilp_data.edits import MIN_STEPS, relabelled, require_enough, trimmed
@@ -99,7 +100,7 @@ def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") ->
         note = f"{counted(report.changed)} removed" + (f": {reason}" if reason else "")
         report.operation = operation.perform("remove", changes, note).number
         store.write_index()
-        report.notes += _sides_left(store)
+        report.notes += _sides_left(store) + broken_by_removal(root, report.changed)
     return report
 
 

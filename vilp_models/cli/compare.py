@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vilp_data.cli.options import JsonOption, PresetOption, print_json
+from vilp_data.cli.options import JsonOption, PresetOption, print_json, progress_bar
 from vilp_models.cli.options import DataOption, TaskOption, VqganOption, dataset_of
 
 
@@ -35,7 +35,8 @@ def compare(
 ) -> None:
     """Train on several action sets with several seeds each, roll all out from the same starts, and report what the labels change.
 
-    Goes on where it stopped. One planner serves all: it learns from video alone, and must be trained.
+    Goes on where it stopped; each choice of --seeds is a report of its own, of all policies that were rolled out from them. One planner
+    serves all: it learns from video alone, and must be trained.
 
     Example: vilp-models compare --data data/pusht --preset cpu --sets small,hybrid --seeds 100000:100050
     """  # fmt: skip
@@ -45,7 +46,7 @@ def compare(
     comparison = SetsComparison(
         root, spec, preset, _names(sets), _names(policies), training_seeds, seeds, episodes, envs, vqgan
     )
-    table, report = compare_sets(comparison, lambda line: print(line, file=sys.stderr))
+    table, report = compare_sets(comparison, lambda line: print(line, file=sys.stderr), progress_bar)
     print_json(table) if as_json else print(
         "\n".join([*report.lines(), f"{comparison.folder}/report.md shows it in full"])
     )

@@ -171,7 +171,7 @@ def _prove_replay(root: Path, spec: TaskSpec, *, episodes: int | None, render: b
         tolerance = env.metadata.get("replay_tolerance")
         report = replay(episode, env)
         reports.append(dataclasses.asdict(report))
-        failed += tolerance is not None and not report.proves(tolerance)
+        failed += tolerance is not None and report.fails(tolerance)
         lines = format_replay(report, tolerance=tolerance)
         if render:
             match = render_match(episode, env)
