@@ -10,7 +10,7 @@ from pathlib import Path
 from vilp_data import shards
 from vilp_data.demonstrations import CUT_TAG
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import VilpDataError
+from vilp_data.errors import UsageError, VilpDataError
 from vilp_data.keys import first_difference
 from vilp_data.latents import FrameEncoder, encoder_names, latents_path, load_encoder, stale_reason
 from vilp_data.spec import TaskSpec
@@ -67,12 +67,12 @@ def stale_latents(root: Path, spec: TaskSpec) -> dict[str, str]:
 
 def run_encoder(run: Path, view: str) -> FrameEncoder | None:
     """The encoder that was trained into `run`: of the kind whose name the folder begins with, as `find_run` reads it, else of
-    the first kind that loads. None for the run of another model."""
+    the first kind that loads. None for the run of another model. StoreError for one that is damaged, whatever it was."""
     named = [name for name in encoder_names() if run.name.startswith(name)]
     if named:
         return load_encoder(max(named, key=len), run, view)
     for name in encoder_names():
-        with contextlib.suppress(VilpDataError):
+        with contextlib.suppress(UsageError):
             return load_encoder(name, run, view)
     return None
 

@@ -14,7 +14,7 @@ import pytest
 from vilp_data.cli import main
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.latents import load_encoder
-from vilp_models.checkpoint import load_checkpoint, run_for_view, save_checkpoint
+from vilp_models.checkpoint import FILE, load_checkpoint, run_for_view, save_checkpoint
 from vilp_models.runs import find_model_run
 
 if TYPE_CHECKING:
@@ -65,6 +65,18 @@ def test_gc_keeps_the_latents_of_the_vqgan_among_runs_of_every_kind(cards: Train
     report = json.loads(said("gc", cards.root, "--json"))
     assert report["found"] == report["notes"] == []
     assert sorted((cards.root / "latents").rglob("*.safetensors")) == latents != []
+
+
+def test_gc_judges_no_latents_while_a_run_is_damaged_whatever_it_is_called(cards: TrainedCards, said: Said) -> None:
+    shutil.copytree(cards.run("vqgan"), cards.root / "runs" / "vqgan-other")
+    mine = cards.root / "runs" / "mine"
+    cards.run("vqgan").rename(mine)
+    (run,) = {run_for_view(mine, view) for view in cards.spec.views}
+    (run / FILE).write_bytes((run / FILE).read_bytes()[:2000])
+    report = json.loads(said("gc", cards.root, "--json"))
+    assert report["found"] == []
+    assert all("mine could not be read" in note for note in report["notes"])
+    assert len(report["notes"]) == len(cards.spec.views)
 
 
 def test_where_only_runs_of_action_sets_are_there_the_option_that_names_them_is_told(tmp_path: Path) -> None:
