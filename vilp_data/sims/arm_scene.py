@@ -14,12 +14,15 @@ import mujoco
 import numpy as np
 from robosuite.controllers import load_composite_controller_config
 from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+from robosuite.models.arenas import TableArena
 
 from vilp_data.errors import UsageError
 from vilp_data.types import F64, U8
 
 ROBOTS = ("Panda", "UR5e")
 CONTROL_RATE_HZ = 20
+TABLE_HEIGHT = 0.8  # of the table of `ArmScene._before_a_table`
+TABLE_SIZE = (0.8, 0.8, 0.05)
 MAX_POSITION_STEP = 0.05  # what the controller's ±1 means, in metres and in radians
 MAX_ROTATION_STEP = 0.5
 
@@ -129,6 +132,14 @@ class ArmScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no types
         """Make the controllers read the joints anew at the next step, after a state was set from outside."""
         for part in self.robots[0].part_controllers.values():
             part.new_update = True
+
+    def _before_a_table(self) -> TableArena:
+        """Stand the arm before a table, for a task that has no arena of its own; the arena with it."""
+        base = self.robots[0].robot_model
+        base.set_base_xpos(base.base_xpos_offset["table"](TABLE_SIZE[0]))
+        arena = TableArena(table_full_size=TABLE_SIZE, table_offset=(0, 0, TABLE_HEIGHT))
+        arena.set_origin([0, 0, 0])
+        return arena
 
     # --- what robosuite calls ---
 

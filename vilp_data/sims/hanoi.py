@@ -6,7 +6,8 @@ import numpy as np
 
 from vilp_data.errors import UsageError
 from vilp_data.sims.arm_env import ArmEnv
-from vilp_data.sims.hanoi_scene import DISC_HEIGHT, DISC_RADII, TABLE_HEIGHT, HanoiScene
+from vilp_data.sims.arm_scene import TABLE_HEIGHT
+from vilp_data.sims.hanoi_scene import DISC_HEIGHT, DISC_RADII, HanoiScene
 
 ON_PEG_RADIUS = 0.010  # a disc on a peg can be 6 mm off centre
 ON_PEG_HEIGHT_ERROR = 0.004

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from vilp_data.sims.arm_motion import CLOSE, OPEN, ArmMotion, at_height, raised
+from vilp_data.sims.arm_scene import TABLE_HEIGHT
 from vilp_data.sims.hanoi import HanoiEnv
-from vilp_data.sims.hanoi_scene import DISC_HEIGHT, TABLE_HEIGHT
+from vilp_data.sims.hanoi_scene import DISC_HEIGHT
 from vilp_data.types import F32, F64
 
 GRIP_ABOVE_CENTRE = 0.004  # the fingertips, 9 mm below the grip site, then end 2 mm above whatever the disc lies on

@@ -10,15 +10,12 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-from robosuite.models.arenas import TableArena
 from robosuite.models.objects import CylinderObject, HollowCylinderObject
 from robosuite.models.tasks import ManipulationTask
 
-from vilp_data.sims.arm_scene import ArmScene, Camera
+from vilp_data.sims.arm_scene import TABLE_HEIGHT, ArmScene, Camera
 from vilp_data.types import F64
 
-TABLE_HEIGHT = 0.8
-TABLE_SIZE = (0.8, 0.8, 0.05)
 MIDDLE_PEG = (0.0, 0.0)
 PEG_SPACING = 0.12
 PEG_HEIGHT = 0.036  # a taller one reaches the palm when the lowest disc is grasped
@@ -77,10 +74,6 @@ class HanoiScene(ArmScene):
 
     def _load_model(self) -> None:
         super()._load_model()
-        base = self.robots[0].robot_model
-        base.set_base_xpos(base.base_xpos_offset["table"](TABLE_SIZE[0]))
-        arena = TableArena(table_full_size=TABLE_SIZE, table_offset=(0, 0, TABLE_HEIGHT))
-        arena.set_origin([0, 0, 0])
         self.pegs = [
             CylinderObject(f"peg{i}", size=[PEG_RADIUS, PEG_HEIGHT / 2], rgba=PEG_COLOUR, joints=None) for i in range(3)
         ]
@@ -91,7 +84,7 @@ class HanoiScene(ArmScene):
             )
             for i in range(self.n_discs)
         ]  # fmt: skip
-        self.model = ManipulationTask(arena, [base], [*self.pegs, *self.discs])
+        self.model = ManipulationTask(self._before_a_table(), [self.robots[0].robot_model], [*self.pegs, *self.discs])
 
     def _setup_references(self) -> None:
         super()._setup_references()

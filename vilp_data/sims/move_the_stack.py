@@ -6,13 +6,13 @@ import numpy as np
 
 from vilp_data.errors import UsageError
 from vilp_data.sims.arm_env import ArmEnv
+from vilp_data.sims.arm_scene import TABLE_HEIGHT
 from vilp_data.sims.move_the_stack_scene import (
     BOARD_SIZE,
     CUP_COLOURS,
     CUP_RADII,
     CUP_SIDES,
     NEST_STEP,
-    TABLE_HEIGHT,
     StackScene,
 )
 from vilp_data.types import F64

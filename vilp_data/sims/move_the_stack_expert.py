@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vilp_data.sims.arm_motion import CLOSE, OPEN, WAYPOINT_STEPS, ArmMotion, at_height, raised
+from vilp_data.sims.arm_scene import TABLE_HEIGHT
 from vilp_data.sims.move_the_stack import MoveTheStackEnv
-from vilp_data.sims.move_the_stack_scene import BOARD_SIZE, CUP_HEIGHT, CUP_SIDES, TABLE_HEIGHT
+from vilp_data.sims.move_the_stack_scene import BOARD_SIZE, CUP_HEIGHT, CUP_SIDES
 from vilp_data.types import F32, F64
 
 GRIP_HEIGHT = CUP_HEIGHT  # of the grip site above the lowest foot: the rim of the lowest cup is between the pads

@@ -12,16 +12,13 @@ from xml.etree.ElementTree import SubElement
 
 import mujoco
 import numpy as np
-from robosuite.models.arenas import TableArena
 from robosuite.models.objects import BoxObject, CompositeObject
 from robosuite.models.tasks import ManipulationTask
 
 from vilp_data.sims.arm_reach import bring_hand
-from vilp_data.sims.arm_scene import ArmScene, Camera
+from vilp_data.sims.arm_scene import TABLE_HEIGHT, ArmScene, Camera
 from vilp_data.types import F64
 
-TABLE_HEIGHT = 0.8
-TABLE_SIZE = (0.8, 0.8, 0.05)
 BOARD_SIZE = (0.13, 0.13, 0.004)
 BOARD_COLOUR = (0.02, 0.02, 0.02, 1.0)
 CUP_HEIGHT = 0.056
@@ -112,13 +109,9 @@ class StackScene(ArmScene):
 
     def _load_model(self) -> None:
         super()._load_model()
-        base = self.robots[0].robot_model
-        base.set_base_xpos(base.base_xpos_offset["table"](TABLE_SIZE[0]))
-        arena = TableArena(table_full_size=TABLE_SIZE, table_offset=(0, 0, TABLE_HEIGHT))
-        arena.set_origin([0, 0, 0])
         self.board = BoxObject("board", size=[side / 2 for side in BOARD_SIZE], rgba=BOARD_COLOUR, joints=None)
         self.cups = [Cup(f"cup{i}", CUP_COLOURS[i]) for i in range(self.n_cups)]
-        self.model = ManipulationTask(arena, [base], [self.board, *self.cups])
+        self.model = ManipulationTask(self._before_a_table(), [self.robots[0].robot_model], [self.board, *self.cups])
 
     def _setup_references(self) -> None:
         super()._setup_references()
