@@ -32,6 +32,7 @@ from vilp_data.shards import write_atomic
 from vilp_data.spec import WindowSpec
 from vilp_data.split_lock import SplitLock, assignment_hash
 from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
+from vilp_data.surgery.undo import undo
 from vilp_data.types import Episode
 
 N = 16
@@ -243,14 +244,23 @@ def test_a_set_that_does_not_hold_is_refused_wherever_it_is_read(
     assert check_set(root, "hybrid")
 
 
-def test_remove_names_the_sets_that_it_breaks_and_no_others(root: Path) -> None:
+def test_surgery_names_the_sets_that_it_breaks_and_no_others(root: Path) -> None:
     lock = lock_action_set(root, "mine", recipe(), given="mine.toml")
     set_path(root, "broken").write_text("{")
     labelled, video_only = sorted(lock.episodes)[0], lock.video_only[0]
     assert remove_episodes(root, [video_only]).notes == []
     (note,) = remove_episodes(root, [labelled]).notes
-    assert note.startswith(f"the action set 'mine' no longer holds: {labelled} gave it labels; `vilp-data undo`, or ")
+    said = f"the action set 'mine' no longer holds: {labelled} gave it labels, and "
+    assert note.startswith(said + "episodes of it are gone; `vilp-data undo`, or ")
     assert "`vilp-data actions --recipe mine.toml --redraw`" in note
+    undo(root)
+
+    (note,) = relabel_episodes(root, [labelled], labels={"object": "green"}).notes
+    assert note.startswith(said + "episodes of it lost the tags of their source; ")
+    undo(root)
+    assert relabel_episodes(root, [labelled], labels={"weather": "fine"}).notes == []  # no source asks for it
+    (note,) = trim_episodes(root, plan_trim(root, [labelled], steps=(2, None))).notes
+    assert note.startswith(said + "episodes of it changed; ")
 
 
 def test_another_recipe_of_the_same_name_is_refused_until_it_is_wanted(root: Path) -> None:

@@ -14,14 +14,16 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.stored_episodes import VIEWS, episode, write_dataset
+from vilp_data.action_sets import recipe_from_dict
 from vilp_data.cli import app
-from vilp_data.dataset_action_sets import FOLDER, SUFFIX
-from vilp_data.dataset_split import read_split
+from vilp_data.dataset_action_sets import FOLDER, SUFFIX, lock_action_set
+from vilp_data.dataset_split import read_split, update_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.film_strips import FORMS, film_strip, fitting_strip
 from vilp_data.measured_fidelity import measured_runs, read_fidelity
 from vilp_data.spec import task_from_dict
+from vilp_data.surgery.operations import remove_episodes
 from vilp_data.types import Episode
 from vilp_data.viewer.dataset_facts import dataset_facts
 from vilp_data.viewer.dataset_page import write_dataset_page
@@ -213,6 +215,36 @@ def test_an_action_set_that_cannot_be_read_is_told_and_hides_nothing(root: Path)
     page = page_of(root)
     assert re.search(r'<dt>set odd</dt><dd><span class="wrong">[^<]+</span>', page)
     assert len(Cards(page).cards) == 4
+
+
+def test_a_set_that_does_not_hold_says_what_to_do_and_no_tick_stands_under_it(tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    write_dataset(root, *(tagged(id, 30, operator="anna") for id in "abcdef"))
+    update_split(root, ratio=0.7, ratio_from="task", seed=0, group_by=None, strata=(), redraw=False)
+    recipe = recipe_from_dict({"source": {"anna": {"where": {"operator": "anna"}, "count": 2}}}, where="x")
+    lock = lock_action_set(root, "small", recipe, given="small")
+
+    def page() -> str:
+        """Without the findings in the episodes themselves."""
+        write_dataset_page(tmp_path / "page.html", replace(dataset_facts(root), findings={}))
+        return (tmp_path / "page.html").read_text(encoding="utf-8")
+
+    assert "nothing to complain about" in page()
+    remove_episodes(root, sorted(lock.episodes)[:1])
+    assert re.search(
+        r'<span class="wrong">[^<]*episodes of it are gone</span> [^<]*<code>vilp-data undo</code>', page()
+    )
+    assert "nothing to complain about" not in page()
+
+
+def test_tags_that_make_the_same_groups_are_shown_once(tmp_path: Path) -> None:
+    paint = {"gray": "{'colour': 'gray'}", "purple": "{'colour': 'purple'}"}
+    colours = ["gray", "purple", "gray", "purple", "gray"]
+    write_dataset(
+        tmp_path / "set", *(tagged(f"e{n}", 8, options=paint[c], object=c) for n, c in enumerate(colours))
+    )  # fmt: skip
+    chips = re.findall(r'<span class="chip "[^>]*>([^<]*)</span>', page_of(tmp_path / "set"))
+    assert chips == [f"object {colour}" for colour in colours]
 
 
 # --- reconstruction -----------------------------------------------------------------------------------------------------

@@ -238,10 +238,5 @@ def _leaks(lock: ActionSetLock, stored: Mapping[str, EpisodeEntry], validating: 
     return [f"{id} is {labelled}" for id, labelled in found if labelled is not None]
 
 
-def counted(n: int) -> str:
-    """`1 episode`, `16 episodes`"""
-    return "1 episode" if n == 1 else f"{n} episodes"
-
-
 def _listed(items: Sequence[str], limit: int = 5) -> str:
     return ", ".join(items[:limit]) + (f" and {len(items) - limit} more" if len(items) > limit else "")

@@ -13,7 +13,7 @@ from vilp_data.action_sets import ActionRecipe, Candidate, choose, effective_epo
 from vilp_data.dataset_split import read_split, side_episodes
 from vilp_data.episode_files import open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import ActionSetError, SpecError, UsageError, nearest, some_of
+from vilp_data.errors import ActionSetError, SpecError, SplitError, UsageError, nearest, some_of
 from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.stats import ChannelStats
 from vilp_data.writer_lock import writer_lock
@@ -122,17 +122,18 @@ def check_set(root: Path, name: str) -> list[ActionSetError]:
     return list(check_action_set(lock, read_split(root), entries, where=set_path(root, name)))
 
 
-def broken_by_removal(root: Path, episodes: Collection[str]) -> list[str]:
-    """A sentence for each set that some of `episodes`, which are gone, gave labels to. A lock that cannot be read tells nothing."""
+def sets_broken_by(root: Path, episodes: Collection[str]) -> list[str]:
+    """A sentence for each set that some of `episodes`, which just changed, give labels to, and that does not hold. A lock that cannot
+    be read tells nothing."""
     notes = []
     for name in set_names(root):
-        with contextlib.suppress(ActionSetError):
+        with contextlib.suppress(ActionSetError, SplitError):
             lock = find_action_set(root, name)
-            if gone := sorted(lock.episodes.keys() & set(episodes)):
+            wrong = [error.what.partition(": ")[2] for error in check_set(root, name)]
+            if wrong and (labelled := sorted(lock.episodes.keys() & set(episodes))):
                 again = f"`vilp-data actions --recipe {lock.given} --redraw` and train again"
-                notes.append(
-                    f"the action set {name!r} no longer holds: {some_of(gone, 5)} gave it labels; `vilp-data undo`, or {again}"
-                )
+                why = f"{some_of(labelled, 5)} gave it labels, and {'; '.join(wrong)}"
+                notes.append(f"the action set {name!r} no longer holds: {why}; `vilp-data undo`, or {again}")
     return notes
 
 

@@ -46,10 +46,15 @@ class EncodedDataset:
         return self.frames_per_s / self.bare_frames_per_s if self.bare_frames_per_s else 0.0
 
 
-def find_run(root: Path, given: Path | None, encoder_name: str, *, option: str = "--run") -> Path:
-    """The folder of the trained encoder: the one given, else the only `runs/<encoder_name>*` of the dataset.
+def find_run(
+    root: Path, given: Path | None, encoder_name: str, *, preset: str | None = None, option: str = "--run"
+) -> Path:
+    """The folder of the trained encoder: the one given, else `runs/<encoder_name>-<preset>`, else the only `runs/<encoder_name>*` of
+    the dataset.
 
     `option` is how a user names one. Raises UsageError where there is no such folder, or it is not clear which."""
+    if given is None and preset is not None:
+        given = root / "runs" / f"{encoder_name}-{preset}"
     if given is not None:
         if not given.is_dir():
             raise UsageError(

@@ -101,7 +101,7 @@ class Loader(Generic[Batch]):
             raise UsageError(
                 "not one whole batch",
                 found=f"{len(dataset)} samples for batches of {batch_size}",
-                remedy="lower batch_size, or keep the last batch with drop_last=False",
+                remedy="lower the recipe's batch_size (--preset tiny is for so little data); in code, drop_last=False keeps the last one",
             )
 
     def __len__(self) -> int:

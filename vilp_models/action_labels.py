@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vilp_data.action_set_lock import DIGITS, counted
+from vilp_data.action_set_lock import DIGITS
 from vilp_data.action_sets import effective_epochs
 from vilp_data.dataset import WindowDataset
 from vilp_data.dataset_action_sets import read_action_set
-from vilp_data.errors import UsageError
+from vilp_data.errors import UsageError, number_of
 from vilp_data.labelled_episodes import LabelledEpisodes
 from vilp_data.pairs import PairDataset
 from vilp_models.checkpoint import RunState
@@ -64,7 +64,7 @@ def epochs_text(labels: LabelledEpisodes, samples: PairDataset | WindowDataset, 
     weights = [source.weight for source in sources]
     epochs = effective_epochs(counts, weights, drawn=recipe.steps * recipe.batch_size)
     said = [
-        f"{source.name} {counted(len(source.episodes))}, {count} samples, {over:.3g} epochs"
+        f"{source.name} {number_of(len(source.episodes), 'episode')}, {count} samples, {over:.3g} epochs"
         for source, count, over in zip(sources, counts, epochs, strict=True)
     ]
     return f"{set_text(set_id(labels))}: {'; '.join(said)}"

@@ -1,7 +1,7 @@
 """Do other labels help? VILP, the oracle and BC trained on several action sets, each with several seeds, from the same starts.
 
     DATA/runs/policy-PRESET-SET-seedK, bc-PRESET-SET-seedK     what is trained
-    DATA/comparisons/PRESET-SET-SET-SEEDS/POLICY-SET-seedK     a rollout each; stay: the one that learns from nothing
+    DATA/comparisons/PRESET-SET-SET-SEEDS/POLICY-SET-seedK     a rollout each (oracle-firstN: of N episodes); stay learns from nothing
     DATA/comparisons/PRESET-SET-SET-SEEDS/report.json, report.md
                                                                all of it, side by side
 
@@ -58,6 +58,7 @@ class SetsComparison:
     seeds         the simulator's starts of VILP and BC, as `parse_seeds` reads them; the oracle begins at held-out episodes of the task's
                   own world, `n_oracle` of them at most
     environments  that are planned for together
+    restart       train anew what is there of another recipe or dataset, instead of refusing
     """
 
     root: Path
@@ -70,6 +71,7 @@ class SetsComparison:
     n_oracle: int | None = None
     environments: int = 50
     vqgan: Path | None = None
+    restart: bool = False
 
     def __post_init__(self) -> None:
         if len(set(self.sets)) < 2:
@@ -172,8 +174,11 @@ def _low_level(comparison: SetsComparison, action_set: str, seed: int, tell: Tol
     recipe = load_recipe(PolicyRecipe, "policy", spec.models, preset=comparison.preset, where=spec.name)
     run, vqgan = comparison.run("policy", action_set, seed), _vqgan(comparison)
     tell(f"low-level policy, {action_set}, seed {seed}")
-    restart = _is_of_another_version(comparison, run, action_set, tell)
-    train_policy(root, spec, recipe, run, vqgan=vqgan, action_set=action_set, restart=restart)
+
+    def train(restart: bool) -> None:
+        train_policy(root, spec, recipe, run, vqgan=vqgan, action_set=action_set, restart=restart)
+
+    _train(comparison, run, action_set, train, tell)
     return _held_out(comparison, action_set, seed)
 
 
@@ -187,8 +192,22 @@ def _train_bc(comparison: SetsComparison, action_set: str, seed: int, tell: Told
     recipe = load_recipe(BcRecipe, "bc", spec.models, preset=comparison.preset, where=spec.name)
     run, n_steps = comparison.run("bc", action_set, seed), _n_action_steps(comparison)
     tell(f"bc, {action_set}, seed {seed}")
-    restart = _is_of_another_version(comparison, run, action_set, tell)
-    train_bc(comparison.root, spec, recipe, run, n_action_steps=n_steps, action_set=action_set, restart=restart)
+
+    def train(restart: bool) -> None:
+        train_bc(comparison.root, spec, recipe, run, n_action_steps=n_steps, action_set=action_set, restart=restart)
+
+    _train(comparison, run, action_set, train, tell)
+
+
+def _train(comparison: SetsComparison, run: Path, action_set: str, train: Callable[[bool], None], tell: Told) -> None:
+    """`train(restart)`: begun anew where the run that is there can serve nobody, or where the user lets what does not fit go."""
+    try:
+        train(_is_of_another_version(comparison, run, action_set, tell))
+    except UsageError as refused:
+        if not comparison.restart:
+            raise
+        tell(f"{run.name} is trained anew: {refused.what}")
+        train(True)
 
 
 def _is_of_another_version(comparison: SetsComparison, run: Path, action_set: str, tell: Told) -> bool:
@@ -244,7 +263,8 @@ def _from_before(comparison: SetsComparison, policy: str, tell: Told) -> dict[tu
 
 
 def _folder(comparison: SetsComparison, policy: str, action_set: str, seed: int) -> Path:
-    return comparison.folder / f"{policy}-{action_set}-seed{seed}"
+    few = f"-first{comparison.n_oracle}" if policy in FOLLOWS_RECORDINGS and comparison.n_oracle else ""
+    return comparison.folder / f"{policy}{few}-{action_set}-seed{seed}"
 
 
 def _planned(comparison: SetsComparison, policy: str, action_set: str, seed: int) -> _Planned:

@@ -154,6 +154,35 @@ def test_a_comparison_from_other_starts_leaves_the_earlier_one_alone(comparison:
     assert json.loads((bc.folder / "report.json").read_text()) == first
 
 
+def test_runs_of_another_recipe_are_refused_until_they_may_go(comparison: SetsComparison) -> None:
+    bc = replace(comparison, policies=("bc",), n_seeds=1)
+    compare_sets(bc, lambda _: None)
+    models = {**bc.spec.models, "bc": {**bc.spec.models.get("bc", {}), "steps": 3}}
+    longer = replace(bc, spec=bc.spec.model_copy(update={"models": models}))
+    with pytest.raises(UsageError, match=r"another recipe(.|\n)*--restart"):
+        compare_sets(longer, lambda _: None)
+    told: list[str] = []
+    compare_sets(replace(longer, restart=True), told.append)
+    assert [line for line in told if "anew" in line or line.startswith("rolling out bc")] == [
+        *(f"bc-{PRESET}-{s}-seed0 is trained anew: this run was trained with another recipe" for s in longer.sets),
+        *(f"rolling out bc, {s}, seed 0" for s in longer.sets),
+    ]
+    told.clear()
+    compare_sets(replace(longer, restart=True), told.append)
+    assert not [line for line in told if "anew" in line or line.startswith("rolling out")]
+
+
+def test_the_oracle_of_fewer_episodes_takes_nothing_from_that_of_all(comparison: SetsComparison) -> None:
+    every = replace(comparison, policies=("oracle",), n_seeds=1)
+    compare_sets(every, lambda _: None)
+    compare_sets(replace(every, n_oracle=1), lambda _: None)
+    folders = {path.name for path in every.folder.iterdir() if path.is_dir()}
+    assert folders == {f"oracle{few}-{s}-seed0" for few in ("", "-first1") for s in every.sets}
+    told: list[str] = []
+    compare_sets(every, told.append)
+    assert not [line for line in told if line.startswith("rolling out")]
+
+
 def test_every_rollout_tells_its_steps(comparison: SetsComparison) -> None:
     done: dict[str, tuple[int, int]] = {}
 

@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
-from vilp_data.action_set_lock import DIGITS, ActionSetLock, counted
-from vilp_data.cli.options import JsonOption, PresetOption, open_dataset, print_json
-from vilp_data.errors import ActionSetError
+from vilp_data.action_set_lock import DIGITS, ActionSetLock
+from vilp_data.cli.options import DatasetArgument, JsonOption, PresetOption, open_dataset, print_json
+from vilp_data.errors import ActionSetError, number_of
 from vilp_data.spec import load_task
 
 
 def actions(
+    dataset: DatasetArgument = None,
     recipe: Annotated[
         str | None,
         typer.Option(
@@ -22,7 +23,8 @@ def actions(
         ),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option("--data", help="Dataset folder. Default: as for the other verbs.", show_default=False)
+        Path | None,
+        typer.Option("--data", help="The dataset folder again, as the other tool has it.", show_default=False),
     ] = None,
     task: Annotated[
         str | None,
@@ -43,7 +45,7 @@ def actions(
     """
     from vilp_data.dataset_action_sets import load_recipe, lock_action_set, set_path
 
-    root, spec = open_dataset(data)
+    root, spec = open_dataset(dataset or data)
     if recipe is None:
         _list_sets(root, as_json=as_json)
         return
@@ -92,7 +94,7 @@ def _list_sets(root: Path, *, as_json: bool) -> None:
 def _counted(lock: ActionSetLock) -> str:
     sides = f"{len(lock.video_only)} video only, {len(lock.validation)} validation"
     give = "gives" if len(lock.episodes) == 1 else "give"
-    return f"{counted(len(lock.episodes))} {give} labels, {sides} (key {lock.key[:DIGITS]})"
+    return f"{number_of(len(lock.episodes), 'episode')} {give} labels, {sides} (key {lock.key[:DIGITS]})"
 
 
 def _details(lock: ActionSetLock) -> list[str]:
@@ -102,7 +104,7 @@ def _details(lock: ActionSetLock) -> list[str]:
         epochs = f"{source.effective_epochs:.3g} effective epochs"
         tags = lock.recipe.source[source.name]
         lines.append(
-            f"  {source.name} ({tags}): {counted(len(source.episodes))}, {source.n_steps} steps, {share}, {epochs}"
+            f"  {source.name} ({tags}): {number_of(len(source.episodes), 'episode')}, {source.n_steps} steps, {share}, {epochs}"
         )
     training = len(lock.episodes) + len(lock.video_only)
     if lock.recipe.video not in (None, training):

@@ -74,8 +74,13 @@ def latents(
     run: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the trained frame encoder. Default: the only one under DATASET/runs.", show_default=False
+            help="Folder of the trained frame encoder. Default: that of --preset, else the only one under DATASET/runs.",
+            show_default=False,
         ),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="The preset whose encoder is meant: DATASET/runs/ENCODER-PRESET.", show_default=False),
     ] = None,
     encoder: Annotated[
         str, typer.Option(help="Kind of frame encoder, as registered under vilp.frame_encoders.")
@@ -90,7 +95,7 @@ def latents(
     from vilp_data.latent_runs import encode_dataset, find_run
 
     root, spec = open_dataset(dataset)
-    folder = find_run(root, run, encoder)
+    folder = find_run(root, run, encoder, preset=preset)
     with latent_bar() as progress:
         done = encode_dataset(root, spec, encoder, folder, workers=workers or cpu_count(), progress=progress)
     if as_json:

@@ -67,16 +67,17 @@ def trim(
 
     Example: vilp-data trim --dry-run
     """
-    from vilp_data.surgery.operations import parse_steps, plan_trim, trim_episodes
+    from vilp_data.surgery.operations import SurgeryReport, parse_steps, plan_trim, trim_episodes
 
     if steps is not None and not episodes:
         raise UsageError("which episodes have these steps?", remedy="name them: vilp-data trim EPISODE… --steps 10:140")
     root, _ = open_dataset(data)
     keep = None if steps is None else parse_steps(steps)
     cuts = plan_trim(root, episodes or (), threshold=threshold, margin_s=margin, steps=keep)
-    operation = None if dry_run else trim_episodes(root, cuts).operation
+    report = SurgeryReport() if dry_run else trim_episodes(root, cuts)
     if as_json:
-        print_json({"operation": operation, "dry_run": dry_run, "cuts": [dataclasses.asdict(cut) for cut in cuts]})
+        table = {"operation": report.operation, "dry_run": dry_run, "notes": report.notes}
+        print_json({**table, "cuts": [dataclasses.asdict(cut) for cut in cuts]})
         return
     cutting, n_steps = [cut for cut in cuts if cut.cuts], sum(cut.n_steps for cut in cuts)
     for cut in cutting:
@@ -93,9 +94,10 @@ def trim(
     done = "would go" if dry_run else "trimmed"
     _say(
         root,
-        operation,
+        report.operation,
         f"{gone} of {n_steps} steps, of {number_of(len(cutting), 'episode')}, {done}" if cutting else "nothing to trim",
     )
+    _list(report.notes)
 
 
 def relabel(

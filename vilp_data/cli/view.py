@@ -9,7 +9,7 @@ import typer
 
 from vilp_data.cli.options import open_dataset, progress_bar
 from vilp_data.episodes import EpisodeStore
-from vilp_data.errors import UsageError
+from vilp_data.errors import UsageError, number_of
 from vilp_data.latents import FrameEncoder, load_encoder
 from vilp_data.locate import is_dataset
 from vilp_data.spec import TaskSpec, load_task
@@ -126,7 +126,9 @@ def _view_dataset(root: Path, run: Path | None, html: Path | None, *, in_rerun: 
     with progress_bar("drawing", len(facts.entries)) as advance:
         form = write_dataset_page(html, facts, progress=advance)
     told = (
-        f"{len(facts.entries)} episodes, up to {form.n_frames} frames of each view" if facts.entries else "no episodes"
+        f"{number_of(len(facts.entries), 'episode')}, up to {form.n_frames} frames of each view"
+        if facts.entries
+        else "no episodes"
     )
     print(f"wrote {html} ({html.stat().st_size / 1e6:.1f} MB): {told}; it opens in any browser")
 
@@ -152,7 +154,7 @@ def _view_generated(
     store, folder = EpisodeStore(root), find_generated(root, run)
     ids = generated_ids(folder)
     if episode_id is None and len(ids) > 1:
-        print(f"{folder}: {len(ids)} episodes, showing {ids[0]}; name another to see it")
+        print(f"{folder}: {number_of(len(ids), 'episode')}, showing {ids[0]}; name another to see it")
     opened = open_generated_episode(store, folder, episode_id or ids[0])
     if html is not None:
         write_generated_page(html, store, opened)

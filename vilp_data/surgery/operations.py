@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vilp_data import history, shards
-from vilp_data.dataset_action_sets import broken_by_removal
+from vilp_data.dataset_action_sets import sets_broken_by
 from vilp_data.dataset_split import find_split, split_by
 from vilp_data.dataset_state import frames_name, steps_name
 from vilp_data.edits import MIN_STEPS, relabelled, require_enough, trimmed
@@ -100,7 +100,7 @@ def remove_episodes(root: Path, episodes: Sequence[str], *, reason: str = "") ->
         note = f"{counted(report.changed)} removed" + (f": {reason}" if reason else "")
         report.operation = operation.perform("remove", changes, note).number
         store.write_index()
-        report.notes += _sides_left(store) + broken_by_removal(root, report.changed)
+        report.notes += _sides_left(store) + sets_broken_by(root, report.changed)
     return report
 
 
@@ -156,6 +156,7 @@ def trim_episodes(root: Path, cuts: Sequence[Trim]) -> SurgeryReport:
             note = f"{counted(report.changed)} trimmed by {gone} steps"
             report.operation = history.begin(root).perform("trim", changes, note).number
             store.write_index()
+            report.notes += sets_broken_by(root, report.changed)
         else:
             store.ensure_index()
     return report
@@ -243,6 +244,7 @@ def relabel_episodes(
             report.operation = history.begin(root).perform("relabel", changes, note).number
             report.notes += _about_labels(lock, labels, unset)
         store.ensure_index()
+        report.notes += sets_broken_by(root, report.changed)
     return report
 
 

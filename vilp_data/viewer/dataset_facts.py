@@ -28,11 +28,13 @@ SIDES = {"train": "training", "val": "validation", None: "neither side"}
 
 @dataclass(frozen=True)
 class NamedSet:
-    """An action set as it is stored. `lock` None: it cannot be read; `wrong`: why, or what does not hold any more."""
+    """An action set as it is stored. `lock` None: it cannot be read; `wrong`: why, or what does not hold any more, and `remedy` what to
+    do about it."""
 
     name: str
     lock: ActionSetLock | None
     wrong: str | None = None
+    remedy: str | None = None
 
     def source_of(self, id: str) -> str | None:
         """The source that the episode gives its actions to; None where it gives none."""
@@ -86,11 +88,22 @@ class DatasetFacts:
         return {name: tags[name] for name in sorted(tags) if len(tags[name]) > 1 or tags[name].total() < n}
 
     def grouping_tags(self) -> dict[str, Counter[str]]:
-        """Those of the varying tags that group episodes, as goals and operators do, and seeds do not."""
+        """Those of the varying tags that group episodes, as goals and operators do, and seeds do not; of tags that make the same groups
+        the one with the shortest values."""
         n = len(self.entries)
-        return {
+        tags = {
             name: of for name, of in self.varying_tags().items() if len(of) <= MOST_VALUES and 2 * len(of) <= max(n, 4)
         }
+        told: dict[frozenset[frozenset[str]], str] = {}
+        for name in sorted(tags, key=lambda name: max(map(len, tags[name]))):
+            told.setdefault(self._groups(name), name)
+        return {name: tags[name] for name in tags if name in told.values()}
+
+    def _groups(self, tag: str) -> frozenset[frozenset[str]]:
+        groups: dict[str | None, set[str]] = {}
+        for entry in self.entries:
+            groups.setdefault(entry.tags.get(tag), set()).add(entry.id)
+        return frozenset(map(frozenset, groups.values()))
 
     def choices(self) -> Iterator[Choice]:
         """Everything to filter by that leaves something to choose."""
@@ -160,7 +173,7 @@ def _sets(root: Path, split: SplitLock | None, entries: Sequence[EpisodeEntry]) 
             yield NamedSet(name, lock, "the split it was chosen in cannot be read")
             continue
         wrong = next(iter(check_action_set(lock, split, entries, where=set_path(root, name))), None)
-        yield NamedSet(name, lock, wrong.what if wrong else None)
+        yield NamedSet(name, lock, wrong.what, wrong.remedy) if wrong else NamedSet(name, lock)
 
 
 def _choice(label: str, told: Iterable[tuple[str, str]]) -> Choice:

@@ -10,11 +10,11 @@ from pathlib import Path
 from statistics import fmean
 
 from vilp_data import shards
-from vilp_data.action_set_lock import counted
 from vilp_data.check.findings import SEVERITIES, counts, grouped, verdict
-from vilp_data.check.page import article, tally
+from vilp_data.check.page import article, tally, with_code
 from vilp_data.check.style import STYLE as PAGE_STYLE
 from vilp_data.check.text import duration
+from vilp_data.errors import number_of
 from vilp_data.film_strips import PAGE_BYTES, StripForm, fitting_strip
 from vilp_data.spec import ActionSpec, VectorSpec
 from vilp_data.viewer.dataset_facts import Choice, DatasetFacts, NamedSet
@@ -45,7 +45,7 @@ def _page(facts: DatasetFacts, form: StripForm, progress: Progress | None) -> It
     yield (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}: {len(facts.entries)} episodes</title><style>{PAGE_STYLE}{STYLE}</style></head><body><main>"
+        f"<title>{escape(title)}: {number_of(len(facts.entries), 'episode')}</title><style>{PAGE_STYLE}{STYLE}</style></head><body><main>"
         f"<header><h1>{escape(title)}</h1>{_lead(facts)}{_tally(facts)}{_about(facts)}</header>{_findings(facts)}"
         f'<section><h2>Episodes</h2>{_filters(choices, numbers, facts)}<div class="episodes">'
     )
@@ -124,7 +124,7 @@ def _vectors(facts: DatasetFacts) -> Iterator[tuple[str, str]]:
         if parts:
             told = ", ".join(f"{escape(part)} {_from(table)}" for part, table in parts.items())
             missing = len(facts.entries) - labelled if name == "action" else 0
-            yield name, told + (f"; {counted(missing)} without" if missing else "")
+            yield name, told + (f"; {number_of(missing, 'episode')} without" if missing else "")
 
 
 def _from(part: VectorSpec | ActionSpec) -> str:
@@ -143,14 +143,15 @@ def _split(facts: DatasetFacts) -> str:
 
 
 def _set(one: NamedSet) -> tuple[str, str]:
-    wrong = f'<span class="wrong">{escape(one.wrong)}</span>' if one.wrong else ""
+    remedy = f" {with_code(one.remedy)}" if one.remedy else ""
+    wrong = f'<span class="wrong">{escape(one.wrong)}</span>{remedy}' if one.wrong else ""
     if one.lock is None:
         return f"set {one.name}", wrong
     sources = ", ".join(
         f"{escape(source.name)} {len(source.episodes)} (weight {source.weight}, effective epochs {source.effective_epochs:.2g})"
         for source in one.lock.sources
     )
-    told = f"actions of {len(one.lock.episodes)} episodes: {sources}; {len(one.lock.video_only)} give video only"
+    told = f"actions of {number_of(len(one.lock.episodes), 'episode')}: {sources}; {len(one.lock.video_only)} of video only"
     return f"set {one.name}", f"{told}. {wrong}" if wrong else told
 
 
@@ -176,7 +177,7 @@ def _reconstruction(facts: DatasetFacts) -> Iterator[tuple[str, str]]:
         f"{escape(view)} {fmean(views[view].psnr_db for views in measured.episodes.values() if view in views):.1f} dB"
         for view in measured.views
     )
-    told += f"{', '.join(each)}, measured on {len(measured.episodes)} episodes"
+    told += f"{', '.join(each)}, measured on {number_of(len(measured.episodes), 'episode')}"
     if facts.other_runs:
         told += (
             f"; also measured, and shown with <code>--run</code>: {escape(', '.join(r.name for r in facts.other_runs))}"
@@ -188,7 +189,8 @@ def _reconstruction(facts: DatasetFacts) -> Iterator[tuple[str, str]]:
 def _findings(facts: DatasetFacts) -> str:
     found = facts.all_findings
     if not found:
-        return tally([])
+        whole = facts.split is None or facts.split.is_intact
+        return tally([]) if whole and not any(one.wrong for one in facts.sets) else ""
     articles = "".join(article(group, with_source=False) for group in grouped(found))
     worst = next(severity for severity in SEVERITIES if counts(found)[severity])
     told = f'Findings: <span class="badge {worst}">{verdict(found)}</span>'

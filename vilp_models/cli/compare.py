@@ -31,6 +31,9 @@ def compare(
     ] = None,
     envs: Annotated[int, typer.Option(min=1, help="Environments that are planned for together.")] = 50,
     vqgan: VqganOption = None,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Train anew what is there of another recipe or dataset; the rest is kept.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train on several action sets with several seeds each, roll all out from the same starts, and report what the labels change.
@@ -44,7 +47,7 @@ def compare(
 
     root, spec = dataset_of(data, task, preset)
     comparison = SetsComparison(
-        root, spec, preset, _names(sets), _names(policies), training_seeds, seeds, episodes, envs, vqgan
+        root, spec, preset, _names(sets), _names(policies), training_seeds, seeds, episodes, envs, vqgan, restart
     )
     table, report = compare_sets(comparison, lambda line: print(line, file=sys.stderr), progress_bar)
     print_json(table) if as_json else print(

@@ -30,9 +30,8 @@ app = typer.Typer(
 @app.command("vqgan")
 def evaluate_vqgan(
     data: DataOption = None,
-    run: Annotated[
-        Path | None, typer.Option(help="The trained run. Default: the only one under DATA/runs.", show_default=False)
-    ] = None,
+    preset: PresetOption = None,
+    run: ModelRunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Report what the VQGAN loses on validation episodes: PSNR and LPIPS, moving pixels, codes, float16; worst frames as a picture.
@@ -44,7 +43,7 @@ def evaluate_vqgan(
     from vilp_models.fidelity_page import read_fresh_report, write_report
 
     root, _ = dataset_of(data, None, None)
-    folder = find_model_run(root, "vqgan", given=run)
+    folder = find_model_run(root, "vqgan", given=run, preset=preset)
     store = EpisodeStore(root)
     episodes = [entry.id for entry in side_episodes(store, "val")]
     inputs = report_inputs(store, folder, episodes)
