@@ -156,6 +156,25 @@ def test_ctrl_c_ends_in_words_and_the_next_run_goes_on(work: Path) -> None:
     assert fresh >= 1
 
 
+@pytest.mark.parametrize("package", ["vilp_data", "vilp_models"])
+def test_ctrl_c_while_the_command_line_is_still_loading_ends_in_words(package: str) -> None:
+    code = f"""
+import sys
+from {package}.__main__ import main
+
+class Pressed:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Pressed())
+main()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 130
+    assert ended.stderr == f"{package.replace('_', '-')}: stopped before it began\n"
+
+
 def test_the_dataset_meant_is_the_one_here_or_the_last_used_or_the_only_one(work: Path) -> None:
     run(work, "ingest", "logs", "--task", "task.toml")
     run(work, "ingest", "replay.zarr", "--task", "zarr.toml")
