@@ -27,6 +27,7 @@ from vilp_models.frames import TrainingFrames, open_clips
 from vilp_models.model_training import Clips, ModelTraining
 from vilp_models.processes import Processes
 from vilp_models.recipe import BcRecipe, PlannerRecipe, PolicyRecipe, TrainingRecipe, VqganRecipe
+from vilp_models.reconstructions import Reconstructions
 from vilp_models.training_loop import Trainee, fit
 from vilp_models.vqgan import VqganEncoder
 from vilp_models.vqgan_training import VqganTraining
@@ -215,16 +216,13 @@ def train_policy(
         if labels is not None and show and processes.is_main:
             print(f"policy {epochs_text(labels, pairs, recipe)}")
         codebooks = {view: encoder.model.quantize.embedding.weight.detach() for view, encoder in encoders.items()}
-
-        def reconstruct(view: str, latents: torch.Tensor) -> torch.Tensor:
-            encoder = encoders[view]
-            with torch.autocast(encoder.device.type, enabled=False):  # as imagined frames are decoded in use
-                return encoder.decode_tensor(latents.to(encoder.device)).to(latents.device)
-
-        def build() -> LowLevelPolicy:
-            return LowLevelPolicy(recipe, agreed, codebooks=codebooks, reconstruct=reconstruct)
-
-        return ModelTraining(recipe, build, pairs, processes)
+        reconstruct = Reconstructions(encoders)
+        return ModelTraining(
+            recipe,
+            lambda: LowLevelPolicy(recipe, agreed, codebooks=codebooks, reconstruct=reconstruct),
+            pairs,
+            processes,
+        )
 
     folder = run_folder(run_dir, views)
     run = Run("policy", views, folder, recipe, trainee, contract, unit="pairs", action_set=set_id(labels))
