@@ -20,7 +20,7 @@ import torch
 from vilp_data import latents
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.latents import LatentJob, encode_batches, encode_one
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 from vilp_data.types import U8, Episode
 from vilp_models.recipe import vqgan_recipe
 from vilp_models.vqgan import VqganEncoder, build_vqgan

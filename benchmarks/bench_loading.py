@@ -36,8 +36,9 @@ from vilp_data.dataset import WindowDataset, WindowTensors
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.latents import latents_path
 from vilp_data.loader import Loader
-from vilp_data.spec import WindowSpec, task_from_dict
+from vilp_data.spec import WindowSpec
 from vilp_data.split import SplitEpisode, draw_split
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Episode
 
 BATCH = 64

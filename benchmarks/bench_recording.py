@@ -31,7 +31,8 @@ from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sims import ENVIRONMENTS, load_entry_point
 from vilp_data.sims.episode_log import START_NS, tick_writer
 from vilp_data.sims.record import RECORDABLE
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task
 from vilp_data.types import F32, F64
 
 DEFAULT_BUFFER = (640, 480)  # width, height

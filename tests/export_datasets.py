@@ -12,8 +12,8 @@ from tests.stored_episodes import episode
 from tests.synthetic import card_frame
 from vilp_data import shards
 from vilp_data.episodes import EpisodeStore, Origin
-from vilp_data.spec import task_from_dict
 from vilp_data.split import SplitEpisode, draw_split
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Episode
 
 HEIGHT, WIDTH = 24, 32

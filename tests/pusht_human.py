@@ -10,7 +10,7 @@ import pytest
 from tests.real_data import real_data
 from vilp_data.assemble import assemble_episode
 from vilp_data.sources import open_log
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 from vilp_data.types import Episode
 
 N_EPISODES = 206

@@ -10,8 +10,8 @@ from vilp_data import shards
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.keys import FORMAT_VERSION
 from vilp_data.latents import latents_path
-from vilp_data.spec import task_from_dict
 from vilp_data.split import SplitEpisode, draw_split
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Episode
 
 VIEWS = ("front", "side")

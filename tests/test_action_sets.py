@@ -21,7 +21,7 @@ from vilp_data.action_sets import (
 )
 from vilp_data.dataset_action_sets import load_recipe, recipe_names
 from vilp_data.errors import ActionSetError, SpecError
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 
 ON_TARGET, OFF_TARGET = {"object": "gray", "goal": "row"}, {"object": "purple", "goal": "row"}
 

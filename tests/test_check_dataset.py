@@ -14,8 +14,8 @@ from vilp_data.check.findings import Finding
 from vilp_data.check.sources import check_sources
 from vilp_data.dataset_split import update_split
 from vilp_data.episodes import EpisodeStore
-from vilp_data.spec import task_from_dict
 from vilp_data.surgery.operations import plan_trim
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Episode
 
 SPEC = {

@@ -17,7 +17,8 @@ from vilp_data.check.log import check_log
 from vilp_data.check.report import BINS
 from vilp_data.check.sources import check_sources
 from vilp_data.errors import UsageError
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task
 
 
 def findings_of(path: Path, **options: Any) -> list[Finding]:

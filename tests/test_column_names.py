@@ -30,7 +30,7 @@ from vilp_data.errors import DecodeError
 from vilp_data.export import export_dataset
 from vilp_data.ingest import ingest_logs
 from vilp_data.short_names import LONGEST_NAME
-from vilp_data.spec import task_from_dict
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Message
 from vilp_data.viewer import draw_episode
 from vilp_data.viewer.generated import draw_generated

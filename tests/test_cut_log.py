@@ -18,8 +18,9 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.ingest import IngestReport, ingest_logs
 from vilp_data.sources.mcap_log import McapLog
-from vilp_data.spec import SplitSpec, TaskSpec, load_task
+from vilp_data.spec import SplitSpec, TaskSpec
 from vilp_data.staleness import stale_episodes
+from vilp_data.task_toml import load_task
 
 MARKER = "/episode"
 

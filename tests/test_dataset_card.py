@@ -14,8 +14,8 @@ from vilp_data.contact_sheet import captioned, stacked
 from vilp_data.dataset_card import SHEET_EPISODES, make_card, write_card
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
-from vilp_data.spec import task_from_dict
 from vilp_data.surgery.operations import plan_trim, relabel_episodes, trim_episodes
+from vilp_data.task_toml import task_from_dict
 
 
 def section(text: str, title: str) -> str:

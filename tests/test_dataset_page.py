@@ -22,8 +22,8 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import StoreError, UsageError
 from vilp_data.film_strips import FORMS, film_strip, fitting_strip
 from vilp_data.measured_fidelity import measured_runs, read_fidelity
-from vilp_data.spec import task_from_dict
 from vilp_data.surgery.operations import remove_episodes
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Episode
 from vilp_data.viewer.dataset_facts import dataset_facts
 from vilp_data.viewer.dataset_page import write_dataset_page

@@ -21,7 +21,7 @@ from vilp_data.demonstrations import (
 )
 from vilp_data.episodes_spec import EpisodesSpec, read_ranges
 from vilp_data.errors import SpecError
-from vilp_data.spec import parse_task
+from vilp_data.task_toml import parse_task
 from vilp_data.types import LogEpisode
 
 S = 10**9

@@ -24,7 +24,7 @@ from vilp_data.export import Choice, export_dataset
 from vilp_data.export.folder import out_folder
 from vilp_data.export.segments import Segment, common_rate_hz
 from vilp_data.ingest import ingest_logs
-from vilp_data.spec import task_from_dict
+from vilp_data.task_toml import task_from_dict
 
 ALL = ("lerobot", "robomimic", "diffusion-policy")
 

@@ -23,7 +23,7 @@ from vilp_data.export.video import CODINGS, VideoWriter, frame_rate, read_video
 from vilp_data.ingest import ingest_logs
 from vilp_data.sources import open_log
 from vilp_data.sources.lerobot_log import LeRobotLog
-from vilp_data.spec import task_from_dict
+from vilp_data.task_toml import task_from_dict
 
 FRONT = "videos/observation.images.front/chunk-000/file-000.mp4"
 

@@ -13,7 +13,7 @@ from tests.test_ingest import ingest
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import StoreError
 from vilp_data.ingest import ingest_logs
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 from vilp_data.writer_lock import writer_lock
 
 
@@ -96,7 +96,7 @@ TWO_WORKERS = """
 import sys
 from pathlib import Path
 from vilp_data.ingest import ingest_logs
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 ingest_logs([Path(sys.argv[1])], Path(sys.argv[2]), load_task(sys.argv[3]), workers=2)
 """
 

@@ -13,8 +13,8 @@ from tests.test_cli import ZARR_TASK
 from vilp_data import history
 from vilp_data.cli import app
 from vilp_data.episodes import EpisodeStore
-from vilp_data.spec import parse_task
 from vilp_data.surgery.operations import relabel_episodes
+from vilp_data.task_toml import parse_task
 
 TASK = ZARR_TASK + '[tags."demo*.zarr"]\ngoal = "here"\n[tags."demo2.zarr"]\nobject = "T"\n'
 

@@ -28,9 +28,10 @@ from vilp_data.held_messages import held_sha256
 from vilp_data.ingest import IngestReport, ingest_logs
 from vilp_data.sources import open_log
 from vilp_data.sources.mcap_log import McapLog
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
 from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
 from vilp_data.surgery.undo import undo
+from vilp_data.task_toml import load_task
 from vilp_data.types import LogEpisode
 
 BURSTS = ((0.0, 20), (5.0, 12), (10.0, 15))

@@ -10,7 +10,7 @@ import pytest
 
 from tests.pusht_human import N_EPISODES, human_episode, simulator
 from vilp_data.errors import UsageError
-from vilp_data.spec import parse_task
+from vilp_data.task_toml import parse_task
 from vilp_data.types import Episode
 from vilp_models.replay import format_replay, replay
 from vilp_models.simulator import make_env

@@ -8,7 +8,8 @@ import pytest
 
 from vilp_data import keys
 from vilp_data.errors import SpecError
-from vilp_data.spec import PRESETS, load_task, parse_task, task_names
+from vilp_data.spec import PRESETS
+from vilp_data.task_toml import load_task, parse_task, task_names
 
 GOOD = 'name = "x"\n[views.front]\ntopic = "/a"\nheight = 8\nwidth = 8\n'
 

@@ -14,7 +14,7 @@ from tests.synthetic import write_mcap
 from vilp_data.cli import app
 from vilp_data.errors import LogError, UsageError
 from vilp_data.ingest import ingest_logs
-from vilp_data.spec import load_task, parse_task
+from vilp_data.task_toml import load_task, parse_task
 
 
 @pytest.fixture

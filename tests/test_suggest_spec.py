@@ -27,8 +27,9 @@ from vilp_data.model_size import common_size, cut_share, model_size
 from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sources import open_log
 from vilp_data.sources.mcap_log import McapLog
-from vilp_data.spec import TaskSpec, parse_task
+from vilp_data.spec import TaskSpec
 from vilp_data.suggest_spec import _part_names, suggest_spec
+from vilp_data.task_toml import parse_task
 from vilp_data.topic_roles import role_of
 from vilp_data.types import Message
 

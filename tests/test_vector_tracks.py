@@ -15,7 +15,8 @@ from vilp_data.assemble import assemble_episode
 from vilp_data.errors import DecodeError, LogError, SpecError
 from vilp_data.ingest import ingest_logs
 from vilp_data.sources import open_log
-from vilp_data.spec import TaskSpec, parse_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import parse_task
 from vilp_data.types import Episode
 from vilp_data.vector_tracks import age_names
 

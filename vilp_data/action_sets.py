@@ -18,7 +18,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from vilp_data.errors import ActionSetError, SpecError, nearest
-from vilp_data.spec import with_preset
+from vilp_data.task_toml import with_preset
 
 _VALUES_SHOWN = 5
 

@@ -18,7 +18,8 @@ from vilp_data.edits import Arrays, Edits, content_hash, edited
 from vilp_data.episode_entry import INDEX_SCHEMA, EpisodeEntry, Origin, entry_of, header_of, row_of
 from vilp_data.errors import StoreError, UsageError, nearest
 from vilp_data.keys import FORMAT_VERSION, content_digest
-from vilp_data.spec import TaskSpec, task_from_dict
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import task_from_dict
 from vilp_data.types import U8, Episode
 from vilp_data.writer_lock import await_settled
 

@@ -15,7 +15,7 @@ from vilp_data.errors import LogError, some_of
 from vilp_data.log_roles import LogRoles, roles_in
 from vilp_data.log_summary import header_gap
 from vilp_data.model_size import common_size, cut_share
-from vilp_data.spec import parse_task
+from vilp_data.task_toml import parse_task
 from vilp_data.topic_roles import Picture, TopicRole, words_of
 
 ONE_CLOCK_S = 1.0

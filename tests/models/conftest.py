@@ -12,7 +12,8 @@ import torch
 
 from tests.synthetic import card_frame
 from vilp_data.episodes import EpisodeStore, Origin
-from vilp_data.spec import TaskSpec, parse_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import parse_task
 from vilp_data.types import Episode
 from vilp_models.frames import Clip, TrainingFrames
 from vilp_models.recipe import VqganRecipe

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 from tests.stored_episodes import add_episodes, episode, write_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task
 from vilp_models.cli import app
 from vilp_models.cli.options import dataset_of
 from vilp_models.compare_sets import SetsComparison

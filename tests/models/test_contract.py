@@ -13,8 +13,9 @@ import pytest
 from tests.stored_episodes import KEYS, episode, write_dataset
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import SplitError, StoreError, UsageError
-from vilp_data.spec import TaskSpec, task_from_dict
+from vilp_data.spec import TaskSpec
 from vilp_data.stats import ChannelStats
+from vilp_data.task_toml import task_from_dict
 from vilp_models.checkpoint import (
     Checkpoint,
     RunState,

@@ -20,7 +20,8 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.latents import latents_path
 from vilp_data.pairs import PairDataset
 from vilp_data.shards import write_shard
-from vilp_data.spec import TaskSpec, parse_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import parse_task
 from vilp_models.policy_page import write_policy_report
 from vilp_models.policy_report import PolicyReport, hold_actions, policy_report
 

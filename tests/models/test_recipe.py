@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 
 from vilp_data.errors import SpecError, UsageError
-from vilp_data.spec import PRESETS, Frozen, load_task, parse_task, task_names
+from vilp_data.spec import PRESETS, Frozen
+from vilp_data.task_toml import load_task, parse_task, task_names
 from vilp_models.recipe import (
     VQGAN_PRESETS,
     BcRecipe,

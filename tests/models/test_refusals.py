@@ -16,8 +16,9 @@ from vilp_data.dataset_split import read_split, update_split
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import VilpDataError
 from vilp_data.latent_runs import encode_dataset
-from vilp_data.spec import TaskSpec, task_from_dict
+from vilp_data.spec import TaskSpec
 from vilp_data.surgery.operations import plan_trim, remove_episodes, trim_episodes
+from vilp_data.task_toml import task_from_dict
 from vilp_models.trained import load_bc, load_low_level, load_planners
 from vilp_models.vqgan import load_frame_encoder
 

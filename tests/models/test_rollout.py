@@ -21,7 +21,8 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.ingest import ingest_logs
 from vilp_data.sources import open_log
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task
 from vilp_data.types import F32, is_rollout
 from vilp_models.environments import Environments
 from vilp_models.policies.base import Observation

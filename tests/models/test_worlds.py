@@ -11,7 +11,7 @@ import pytest
 from tests.stored_episodes import episode, write_dataset
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 from vilp_models.simulator import Worlds, is_of_world, world_tags
 from vilp_models.starts import episode_starts
 

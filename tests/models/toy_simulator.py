@@ -8,7 +8,8 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from vilp_data.spec import TaskSpec, parse_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import parse_task
 
 GOAL = 8.0
 

@@ -15,7 +15,8 @@ from tests.synthetic import card_frame
 from vilp_data.dataset_split import read_split
 from vilp_data.episodes import EpisodeStore
 from vilp_data.latent_runs import encode_dataset
-from vilp_data.spec import TaskSpec, parse_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import parse_task
 from vilp_data.types import Episode
 from vilp_models.recipe import BcRecipe, PlannerRecipe, PolicyRecipe, load_recipe
 from vilp_models.runs import default_run

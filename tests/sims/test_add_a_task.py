@@ -18,7 +18,8 @@ from vilp_data.errors import UsageError
 from vilp_data.sims import record
 from vilp_data.sims.record import record_task
 from vilp_data.sources import open_log
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task
 from vilp_models.replay import render_match, replay
 from vilp_models.simulator import make_env
 

@@ -14,7 +14,8 @@ from vilp_data.errors import DecodeError, UsageError
 from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sims.episode_log import START_NS, array_writer, tick_writer
 from vilp_data.sources import open_log
-from vilp_data.spec import TaskSpec, load_task, parse_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task, parse_task
 from vilp_data.types import Message
 
 PICTURE = np.full((8, 8, 3), 128, np.uint8)

@@ -13,7 +13,8 @@ from vilp_data.errors import UsageError
 from vilp_data.sims import record
 from vilp_data.sims.record import RecordedEpisode, record_task
 from vilp_data.sources import open_log
-from vilp_data.spec import SimSpec, TaskSpec, load_task
+from vilp_data.spec import SimSpec, TaskSpec
+from vilp_data.task_toml import load_task
 from vilp_data.types import Episode
 
 pytestmark = pytest.mark.sim

@@ -15,7 +15,8 @@ from vilp_data.errors import SpecError, UsageError
 from vilp_data.sims import record
 from vilp_data.sims.record import RecordedEpisode, record_task
 from vilp_data.sources import open_log
-from vilp_data.spec import SimSpec, TaskSpec, load_task
+from vilp_data.spec import SimSpec, TaskSpec
+from vilp_data.task_toml import load_task
 from vilp_data.types import Episode
 from vilp_models.metrics import psnr
 from vilp_models.replay import render_match, replay

@@ -26,7 +26,7 @@ from vilp_data.errors import LogError
 from vilp_data.ingest import ingest_logs
 from vilp_data.log_summary import LogSummary, format_summary, summarise
 from vilp_data.sources import open_log
-from vilp_data.spec import parse_task
+from vilp_data.task_toml import parse_task
 
 SUFFIXES = (".mcap", ".bag", ".db3")
 METADATA_ALONE = (

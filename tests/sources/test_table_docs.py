@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vilp_data.cli import app
-from vilp_data.spec import parse_task
+from vilp_data.task_toml import parse_task
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "table_logs.md").read_text(encoding="utf-8")
 TASKS = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)

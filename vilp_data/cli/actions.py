@@ -10,7 +10,7 @@ import typer
 from vilp_data.action_set_lock import DIGITS, ActionSetLock
 from vilp_data.cli.options import DatasetArgument, JsonOption, PresetOption, open_dataset, print_json
 from vilp_data.errors import ActionSetError, number_of
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 
 
 def actions(

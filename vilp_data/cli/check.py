@@ -10,7 +10,7 @@ import typer
 
 from vilp_data.cli.options import JsonOption, WorkersOption, console, open_dataset, print_json, progress_bar
 from vilp_data.engine import cpu_count
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 
 
 def check(

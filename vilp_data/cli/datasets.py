@@ -19,7 +19,7 @@ from vilp_data.cli.options import (
 )
 from vilp_data.engine import cpu_count
 from vilp_data.errors import number_of, some_of
-from vilp_data.spec import load_task
+from vilp_data.task_toml import load_task
 
 
 def split(

@@ -29,7 +29,8 @@ from vilp_data.errors import UsageError, number_of, some_of
 from vilp_data.locate import a_dataset, default_root, find_dataset, has_been_dataset, is_dataset, remember
 from vilp_data.log_files import find_logs, is_one_log
 from vilp_data.sources.rosbag2_metadata import is_bag_folder
-from vilp_data.spec import TaskSpec, load_task, task_names
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task, task_names
 
 if TYPE_CHECKING:
     from vilp_data.ingest import IngestReport

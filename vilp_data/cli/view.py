@@ -12,7 +12,8 @@ from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError, number_of
 from vilp_data.latents import FrameEncoder, load_encoder
 from vilp_data.locate import is_dataset
-from vilp_data.spec import TaskSpec, load_task
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task
 
 
 def view(

@@ -11,7 +11,8 @@ import typer
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_data.locate import default_root, find_dataset, is_dataset, remember
-from vilp_data.spec import TaskSpec, load_task, task_names
+from vilp_data.spec import TaskSpec
+from vilp_data.task_toml import load_task, task_names
 
 DataOption = Annotated[
     Path | None, typer.Option("--data", help="Dataset folder. Default: data/TASK.", show_default=False)
