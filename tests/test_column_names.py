@@ -264,8 +264,8 @@ def test_a_typed_message_is_looked_at_again_where_its_list_grows_before_an_index
 def test_a_lerobot_log_s_names_reach_the_card_the_export_and_the_check(tmp_path: Path) -> None:
     store = ingested(tmp_path)
     card = make_card(store).markdown
-    assert "| `low_dim[1]` | joints.two |" in card
-    assert "| `action[0]` | joints.one |" in card
+    assert "| `low_dim[1]` | `joints.two` |" in card
+    assert "| `action[0]` | `joints.one` |" in card
     export_dataset(store.root, tmp_path / "out", "lerobot", images="png")
     features = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
     assert features["observation.state"]["names"] == ["joints.one", "joints.two"]
@@ -295,12 +295,12 @@ def test_a_generated_episode_s_curves_bear_the_log_s_names(tmp_path: Path) -> No
 def test_an_index_range_of_a_feature_keeps_its_names(tmp_path: Path) -> None:
     part = {"topic": "observation.state", "clock": "log", "fields": ["[1:2]"]}
     store = ingested(tmp_path, whole(low_dim={"second": part}))
-    assert "| `low_dim[0]` | second.two |" in make_card(store).markdown
+    assert "| `low_dim[0]` | `second.two` |" in make_card(store).markdown
 
 
 def test_an_action_taken_from_a_state_has_the_state_s_names(tmp_path: Path) -> None:
     store = ingested(tmp_path, whole(action={"next": {"from": "joints"}}))
-    assert "| `action[1]` | next.two |" in make_card(store).markdown
+    assert "| `action[1]` | `next.two` |" in make_card(store).markdown
 
 
 def test_joints_and_frames_of_a_ros_log_are_named(tmp_path: Path) -> None:
@@ -351,7 +351,7 @@ def test_a_dataset_from_before_there_were_names_reads_as_it_did(tmp_path: Path) 
     pq.write_table(table.drop_columns(["column_names"]), store.index_path)
     (entry,) = store.index()
     assert entry.column_names == {}
-    assert "| `low_dim[1]` | arm.1 |" in make_card(store).markdown
+    assert "| `low_dim[1]` | `arm.1` |" in make_card(store).markdown
 
 
 @pytest.mark.slow
@@ -360,5 +360,5 @@ def test_a_real_robot_s_joints_keep_their_names(tmp_path: Path) -> None:
     spec = whole(name="g1", rate_hz=None, views=views)
     ingest_logs([real_data("g1_inspire_lerobot")], tmp_path, spec, workers=1)
     card = make_card(EpisodeStore(tmp_path)).markdown
-    assert "| `low_dim[0]` | joints.kLeftShoulderPitch |" in card
-    assert "| `action[25]` | joints.kRightHandThumbRotation |" in card
+    assert "| `low_dim[0]` | `joints.kLeftShoulderPitch` |" in card
+    assert "| `action[25]` | `joints.kRightHandThumbRotation` |" in card

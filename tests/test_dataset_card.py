@@ -29,8 +29,8 @@ def test_the_card_counts_what_is_there(tmp_path: Path) -> None:
     assert "| `side` | 32 x 24 | RGB | 18 | 0.53 | `/side` |" in section(text, "Views")
     assert "| training | 2 | 23 |" in section(text, "Split")
     tags = section(text, "Outcomes and tags")
-    assert "| (outcome) | success (2), unknown (1) |" in tags
-    assert "| `operator` | ann (1); 2 without |" in tags
+    assert "| (outcome) | `success` (2), `unknown` (1) |" in tags
+    assert "| `operator` | `ann` (1); 2 without |" in tags
     assert "`pick.mcap`" in section(text, "Sources")
     assert "ab" * 32 in section(text, "Sources")
     assert "CC-BY-4.0" in section(text, "Licence")
@@ -38,7 +38,7 @@ def test_the_card_counts_what_is_there(tmp_path: Path) -> None:
     numbers = section(text, "Numbers")
     training = np.concatenate([one.action for one in episodes[:2] if one.action is not None])
     row = next(line for line in numbers.splitlines() if line.startswith("| `action[1]`"))
-    assert "| target.y | absolute, m, frame base |" in row
+    assert "| `target.y` | absolute, m, frame base |" in row
     assert f"{training[:, 1].astype(np.float64).mean():.6g}" in row
     assert "valid steps of 2 training episodes" in numbers
 
@@ -96,8 +96,10 @@ def test_many_episodes_are_shown_by_a_few(tmp_path: Path) -> None:
 
 
 def test_a_name_that_would_break_the_table_does_not(tmp_path: Path) -> None:
-    write(tmp_path, demonstration("odd", 4, tags={"note": "left | right\nup"}))
-    assert "left \\| right up (1)" in make_card(EpisodeStore(tmp_path)).markdown
+    write(tmp_path, demonstration("odd", 4, tags={"note": "left | right\nup", "`<b>": "`</code><img src=x>"}))
+    markdown = make_card(EpisodeStore(tmp_path)).markdown
+    assert "`left \\| right up` (1)" in markdown
+    assert "| `'<b>` | `'</code><img src=x>` (1) |" in markdown
 
 
 def test_parts_of_unknown_width_are_said_to_be_so(tmp_path: Path) -> None:

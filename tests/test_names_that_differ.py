@@ -27,8 +27,8 @@ def test_logs_that_name_a_column_differently_are_said_to(tmp_path: Path) -> None
     assert any("low_dim.leg" in note and "differently" in note and "`names`" in note for note in report.notes)
     card = make_card(store).markdown
     assert "Logs name the numbers of low_dim.leg differently" in card
-    assert "| `low_dim[0]` | leg.0 |" in card
-    assert "| `low_dim[2]` | leg.toe |" in card
+    assert "| `low_dim[0]` | `leg.0` |" in card
+    assert "| `low_dim[2]` | `leg.toe` |" in card
 
 
 def test_digits_that_a_log_uses_as_names_are_names(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_digits_that_a_log_uses_as_names_are_names(tmp_path: Path) -> None:
 def test_a_log_without_names_contradicts_none(tmp_path: Path) -> None:
     store, report = ingested_json(tmp_path, leg(ORDERS[0]), leg([], first=3), low_dim=LEG)
     assert report.notes == []
-    assert "| `low_dim[1]` | leg.knee |" in make_card(store).markdown
+    assert "| `low_dim[1]` | `leg.knee` |" in make_card(store).markdown
 
 
 def test_merged_datasets_that_name_a_column_differently_are_said_to(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_names_taken_out_beside_the_messages_are_gone_with_the_next_ingest(tmp_p
     info.write_text(info.read_text().replace('{"motors": ["one", "two"]}', "null"))
     ingest_logs([tmp_path / "log"], store.root, whole(), workers=1)
     assert [entry.column_names["low_dim"]["joints"] for entry in store.index()] == [["", ""]] * 2
-    assert "| `low_dim[1]` | joints.1 |" in make_card(store).markdown
+    assert "| `low_dim[1]` | `joints.1` |" in make_card(store).markdown
 
 
 def test_a_dataset_from_before_there_were_names_gets_those_beside_the_messages(tmp_path: Path) -> None:

@@ -173,6 +173,11 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(row)} |" for row in [list(head), ["---"] * len(head), *cells]]
 
 
+def _code(text: str) -> str:
+    """A name that came from a log, which is to stay text whatever it holds."""
+    return f"`{text.replace('`', chr(39))}`"
+
+
 def _summary(entries: Sequence[EpisodeEntry]) -> str:
     seconds = sorted(entry.n_steps / entry.rate_hz for entry in entries)
     steps, labelled = sum(entry.n_steps for entry in entries), sum(entry.has_action for entry in entries)
@@ -202,7 +207,7 @@ def _views(store: EpisodeStore, spec: TaskSpec, entries: Sequence[EpisodeEntry])
         images = sum(entry.n_frames[view] for entry in entries)
         steps = sum(entry.n_steps for entry in entries)
         rows.append(
-            [f"`{view}`", f"{width} x {height}", meaning, str(images), f"{images / steps:.2f}", f"`{table.topic}`"]
+            [_code(view), f"{width} x {height}", meaning, str(images), f"{images / steps:.2f}", _code(table.topic)]
         )
     return _table(["view", "width x height", "pixels, uint8", "stored images", "images a step", "topic"], rows)
 
@@ -234,7 +239,9 @@ def _vectors(
         for part, (labels, numbers) in columns.items():
             for label, number in zip(labels, numbers[0].astype(int).tolist(), strict=True):
                 values = [f"{array[number]:.6g}" for array in (stats.mean, stats.std, stats.min, stats.max)]
-                rows.append([f"`{name}[{number}]`", f"{part}.{label}".strip("."), _meaning(parts.get(part)), *values])
+                rows.append(
+                    [f"`{name}[{number}]`", _code(f"{part}.{label}".strip(".")), _meaning(parts.get(part)), *values]
+                )
         if list(columns) == [""] and len(parts) > 1:
             untold.append(f"The task does not say how wide each part of {name} is; in order: {', '.join(parts)}.")
     differing = names_that_differ(entry.column_names for entry in entries)
@@ -250,7 +257,7 @@ def _vectors(
 
 def _meaning(part: ActionSpec | VectorSpec | None) -> str:
     if not isinstance(part, ActionSpec):
-        return f"`{part.topic}`" if part is not None else ""
+        return _code(str(part.topic)) if part is not None else ""
     unit = f", {part.unit}" if part.unit else ", unit not stated"
     frame = f", frame {part.frame}" if part.frame else ""
     return f"{part.kind.replace('_', ' ')}{unit}{frame}"
@@ -290,7 +297,7 @@ def _tags(entries: Sequence[EpisodeEntry]) -> list[str]:
     for name in sorted({name for entry in entries for name in entry.tags}):
         counts = Counter(entry.tags[name] for entry in entries if name in entry.tags)
         missing = len(entries) - counts.total()
-        rows.append([f"`{name}`", _counted(counts) + (f"; {missing} without" if missing else "")])
+        rows.append([_code(name), _counted(counts) + (f"; {missing} without" if missing else "")])
     edited = {what: sum(what in entry.edits for entry in entries) for what in ("labels", "trim")}
     words = {"labels": "relabelled", "trim": "trimmed"}
     told = [f"{number_of(count, 'episode')} {words[what]}" for what, count in edited.items() if count]
@@ -303,8 +310,8 @@ def _tags(entries: Sequence[EpisodeEntry]) -> list[str]:
 def _counted(counts: Counter[str]) -> str:
     if len(counts) > MOST_VALUES:
         values = sorted(counts)
-        return f"{len(counts)} different, such as {values[0]}, {values[1]}"
-    return ", ".join(f"{value} ({count})" for value, count in sorted(counts.items()))
+        return f"{len(counts)} different, such as {_code(values[0])}, {_code(values[1])}"
+    return ", ".join(f"{_code(value)} ({count})" for value, count in sorted(counts.items()))
 
 
 def _findings(entries: Sequence[EpisodeEntry]) -> Iterator[str]:
@@ -320,7 +327,7 @@ def _findings(entries: Sequence[EpisodeEntry]) -> Iterator[str]:
         yield ""
     for one in alike[:MOST_FINDINGS]:
         others = f" (and the like in {len(one.episodes) - 1} more)" if len(one.episodes) > 1 else ""
-        yield f"- `{one.episodes[0]}`: {one.sentence}{others}"
+        yield f"- {_code(one.episodes[0])}: {one.sentence}{others}"
     if len(alike) > MOST_FINDINGS:
         yield f"- and {len(alike) - MOST_FINDINGS} other kinds"
 
@@ -335,7 +342,7 @@ def _sources(entries: Sequence[EpisodeEntry]) -> Iterator[str]:
         told = (
             f"`{hashes[0]}`" if len(hashes) == 1 else f"`{digest(hashes)}`, over those of {len(hashes)} demonstrations"
         )
-        rows.append([f"`{source}`", str(len(logs[source])), told])
+        rows.append([_code(source), str(len(logs[source])), told])
     yield from _table(["log", "episodes", "SHA-256"], rows)
     yield ""
     if len(logs) > MOST_SOURCES:
