@@ -241,7 +241,11 @@ def test_tags_that_make_the_same_groups_are_shown_once(tmp_path: Path) -> None:
     paint = {"gray": "{'colour': 'gray'}", "purple": "{'colour': 'purple'}"}
     colours = ["gray", "purple", "gray", "purple", "gray"]
     write_dataset(
-        tmp_path / "set", *(tagged(f"e{n}", 8, options=paint[c], object=c) for n, c in enumerate(colours))
+        tmp_path / "set",
+        *(
+            tagged(f"e{n}", 8, options=paint[c], object=c, **({} if c == "gray" else {"off": "1"}))
+            for n, c in enumerate(colours)
+        ),
     )  # fmt: skip
     chips = re.findall(r'<span class="chip "[^>]*>([^<]*)</span>', page_of(tmp_path / "set"))
     assert chips == [f"object {colour}" for colour in colours]

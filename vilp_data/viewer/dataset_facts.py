@@ -89,13 +89,13 @@ class DatasetFacts:
 
     def grouping_tags(self) -> dict[str, Counter[str]]:
         """Those of the varying tags that group episodes, as goals and operators do, and seeds do not; of tags that make the same groups
-        the one with the shortest values."""
+        one alone: rather one that all have, rather one with short values."""
         n = len(self.entries)
         tags = {
             name: of for name, of in self.varying_tags().items() if len(of) <= MOST_VALUES and 2 * len(of) <= max(n, 4)
         }
         told: dict[frozenset[frozenset[str]], str] = {}
-        for name in sorted(tags, key=lambda name: max(map(len, tags[name]))):
+        for name in sorted(tags, key=lambda name: (tags[name].total() < n, max(map(len, tags[name])))):
             told.setdefault(self._groups(name), name)
         return {name: tags[name] for name in tags if name in told.values()}
 
