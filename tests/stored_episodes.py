@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from vilp_data import shards
+from vilp_data.dataset_split import split_episodes
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.keys import FORMAT_VERSION
 from vilp_data.latents import latents_path
-from vilp_data.split import SplitEpisode, draw_split
+from vilp_data.split import draw_split
 from vilp_data.task_toml import task_from_dict
 from vilp_data.types import Episode
 
@@ -52,7 +54,8 @@ def write_latents(root: Path, name: str, *, views: tuple[str, ...] = VIEWS) -> N
 
 
 def write_split(root: Path, *, ratio: float = 0.5) -> None:
-    episodes = [SplitEpisode(entry.id, entry.content_sha256) for entry in EpisodeStore(root).index()]
+    known = split_episodes(EpisodeStore(root), None, ())
+    episodes = [replace(episode, thumbnails=None) for episode in known]  # of random frames: nothing looks alike
     shards.write_atomic(root / "split.lock.json", draw_split(episodes, ratio=ratio, seed=0).to_json())
 
 

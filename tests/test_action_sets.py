@@ -26,9 +26,11 @@ from vilp_data.task_toml import load_task
 ON_TARGET, OFF_TARGET = {"object": "gray", "goal": "row"}, {"object": "purple", "goal": "row"}
 
 
-def episodes(count: int, tags: dict[str, str] = ON_TARGET, *, prefix: str = "e", mute: int = 0) -> list[Candidate]:
-    """`count` of these tags, the first `mute` of them without actions."""
-    return [Candidate(f"{prefix}{i:03}", tags, i >= mute) for i in range(count)]
+def episodes(
+    count: int, tags: dict[str, str] = ON_TARGET, *, prefix: str = "e", mute: int = 0, masked: int = 0
+) -> list[Candidate]:
+    """`count` of these tags, the first `mute` of them without actions, the last `masked` without a valid step."""
+    return [Candidate(f"{prefix}{i:03}", tags, i >= mute, 9 * (i < count - masked)) for i in range(count)]
 
 
 def recipe(**sources: dict[str, Any]) -> ActionRecipe:
@@ -39,7 +41,7 @@ def recipe(**sources: dict[str, Any]) -> ActionRecipe:
 
 
 candidates = st.lists(st.tuples(st.sampled_from(["gray", "purple"]), st.booleans()), min_size=1, max_size=30).map(
-    lambda rows: [Candidate(f"e{i:02}", {"object": colour}, acts) for i, (colour, acts) in enumerate(rows)]
+    lambda rows: [Candidate(f"e{i:02}", {"object": colour}, acts, 9) for i, (colour, acts) in enumerate(rows)]
 )
 
 
@@ -107,6 +109,8 @@ def test_other_values_of_a_tag_are_asked_for_without_naming_them() -> None:
         ({"where": {"object": "grey"}}, episodes(3), r"no training episode has object = grey(.|\n)*object = gray \(3\)"),
         ({"count": 4}, episodes(3), r"too few for 4 episodes(.|\n)*3 of 3 training episodes with any tags(.|\n)*--preset tiny"),
         ({"count": 2}, episodes(3, mute=2), r"1 of 3 training episodes with any tags; 2 more have no actions"),
+        ({"count": 2}, episodes(3, masked=2), r"1 of 3 training episodes with any tags; 2 more have no valid step"),
+        ({"count": 2}, episodes(4, mute=1, masked=2), r"1 of 4 .* any tags; 1 more have no actions; 2 more have no valid step\n"),
         ({"where_not": {"object": "gray"}}, episodes(3), r"too few for one episode(.|\n)*0 of 3(.|\n)*object not gray"),
     ],
 )  # fmt: skip
@@ -153,6 +157,12 @@ def test_effective_epochs_account_for_every_sample_that_is_drawn(data: st.DataOb
         ("sauce = 3\n[source.a]", r"unknown key sauce; did you mean 'source'"),
         ("[source.a]\ncount = 0", "source.a.count: "),
         ("[source.a]\nweight = 0", "source.a.weight: "),
+        ("[source.a]\ncount = true", "source.a.count: "),
+        ("[source.a]\ncount = 2.0", "source.a.count: "),
+        ('[source.a]\nweight = "3"', "source.a.weight: "),
+        ("[source.a]\nseed = false", "source.a.seed: "),
+        ("video = true\n[source.a]", "video: "),
+        ("presets = 3\n[source.a]", "`presets` holds tables"),
         ("[source.a]\nwhere = { success = true }", r'tags are text, such as success = "true"'),
         ("[source.a", "not valid TOML"),
     ],
@@ -188,6 +198,21 @@ def test_a_preset_overrides_a_recipe() -> None:
     assert (tiny.count, tiny.weight) == (1, 2)
     with pytest.raises(SpecError, match=r"unknown preset \[presets.tinny\](.|\n)*did you mean 'tiny'"):
         parse_recipe(text.replace("tiny", "tinny"), where="x")
+
+
+@pytest.mark.parametrize("preset", [None, "tiny", "cpu"])
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("[presets.tiny.source.zz]\nweight = 3", r"\[presets.tiny\]: it has no source 'zz'(.|\n)*known: gray"),
+        ("[presets.tiny.source.grey]\ncount = 1", r"no source 'grey' for a preset to change(.|\n)*did you mean 'gray'"),
+        ("[presets.tiny.source.gray]\ncnt = 1", r"\[presets.tiny\]: (.|\n)*unknown key source.gray.cnt; did you mean 'count'"),
+        ("[presets.cpu.source.gray]\ncount = 0", r"\[presets.cpu\]: (.|\n)*source.gray.count"),
+    ],
+)  # fmt: skip
+def test_every_preset_is_proved_whenever_its_recipe_is_read(table: str, said: str, preset: str | None) -> None:
+    with pytest.raises(SpecError, match=rf"mine.toml, (.|\n)*{said}"):
+        parse_recipe(f"[source.gray]\ncount = 2\n{table}\n", where="mine.toml", preset=preset)
 
 
 RECORDED = {  # task: what its own episodes are tagged, and those of its variants

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from tests.test_dataset_action_sets import root, split  # noqa: F401  (the fixture)
+from vilp_data.check.dataset import check_dataset
 from vilp_data.cli import app
 from vilp_data.dataset_action_sets import read_action_set, set_path
 from vilp_data.errors import ActionSetError, SpecError, UsageError
@@ -76,6 +78,7 @@ def test_the_list_proves_every_set_again_and_ends_with_1_where_one_does_not_hold
     ("content", "words"),
     [
         (b"{", "not JSON: "),
+        (b'{"format": 1, "action": {"mean": [NaN]}}', "NaN, which is no number"),
         (b"\xff", "not JSON: "),
         (b"[]", "a list, not a table"),
         (b'{"format": 1}', "it lacks 'name'"),
@@ -90,10 +93,36 @@ def test_a_lock_that_cannot_be_read_hides_no_other(recipe: str, content: bytes, 
     assert f"broken: cannot be read\n  {set_path(Path(), 'broken')}: not the lock of an action set" in text
     assert f"found: {words}" in text
     assert "Error(" not in text
-    assert "`vilp-data actions --recipe broken --redraw`" in text
+    assert "`vilp-data actions . --recipe broken --redraw`" in text
     table = json.loads(said("--json", ends=1))
     assert table["mine"]["wrong"] == []
     assert (table["broken"]["key"], len(table["broken"]["wrong"])) == (None, 1)
+
+
+def test_what_is_no_file_is_no_set_and_a_split_that_is_gone_hides_none(recipe: str) -> None:
+    said("--recipe", recipe)
+    set_path(Path(), "folder").mkdir()
+    assert "folder" not in said()
+    with pytest.raises(UsageError, match="a folder where the lock belongs"):
+        CliRunner().invoke(
+            app, ["actions", "--data", ".", "--recipe", str(shutil.copy(recipe, "folder.toml"))], catch_exceptions=False
+        )
+    Path("split.lock.json").unlink()
+    assert "mine: 3 episodes give labels" in (text := said(ends=1))
+    assert "this dataset has no split yet" in text
+
+
+def test_check_tells_the_sets_that_do_not_hold(recipe: str) -> None:
+    said("--recipe", recipe)
+    shutil.copy(set_path(Path(), "mine"), set_path(Path(), "other"))
+    assert [finding for finding in check_dataset(Path()).findings if finding.kind == "action-set"] == []
+    set_path(Path(), "other").write_text("{")
+    remove_episodes(Path(), [read_action_set(Path(), "mine").entries[0].id])
+    first, second = (finding for finding in check_dataset(Path()).findings if finding.kind == "action-set")
+    assert (first.severity, first.what) == ("warning", "action set 'mine': episodes of it are gone")
+    assert first.remedy is not None
+    assert "`vilp-data actions . --recipe mine.toml --redraw`" in first.remedy
+    assert second.evidence["file"] == str(set_path(Path(), "other"))
 
 
 def test_a_name_means_a_recipe_of_the_datasets_task_or_of_the_one_named(recipe: str) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,22 +19,24 @@ from vilp_data.action_set_lock import ActionSetLock
 from vilp_data.action_sets import recipe_from_dict
 from vilp_data.dataset import WindowDataset
 from vilp_data.dataset_action_sets import (
-    check_set,
+    check_sets,
     find_action_set,
     lock_action_set,
     read_action_set,
     set_names,
     set_path,
 )
-from vilp_data.dataset_split import lock_path, read_split, update_split
+from vilp_data.dataset_split import check_dataset_split, lock_path, read_split, update_split
 from vilp_data.episodes import EpisodeStore, Origin
 from vilp_data.errors import ActionSetError, UsageError
+from vilp_data.open_episodes import OpenEpisodes
 from vilp_data.pairs import PairDataset
 from vilp_data.shards import write_atomic
 from vilp_data.spec import WindowSpec
 from vilp_data.split_lock import SplitLock, assignment_hash
 from vilp_data.surgery.operations import plan_trim, relabel_episodes, remove_episodes, trim_episodes
 from vilp_data.surgery.undo import undo
+from vilp_data.twins import twin_hashes
 from vilp_data.types import Episode
 
 N = 16
@@ -42,6 +46,12 @@ def tagged(number: int) -> Episode:
     """Every third is purple; every fifth has no actions; lengths differ, and some steps are invalid."""
     one = episode(f"e{number:02}", 9 + number % 4, with_action=number % 5 != 4, invalid=(3,) if number % 7 == 0 else ())
     return replace(one, tags={"object": "purple" if number % 3 == 0 else "gray"})
+
+
+def twin(store: EpisodeStore, id: str, name: str) -> Episode:
+    """What `id` did, under other pictures and another name."""
+    original = store.read(id)
+    return replace(original, id=name, frames={view: 255 - frames for view, frames in original.frames.items()})
 
 
 @pytest.fixture
@@ -101,7 +111,7 @@ def test_locking_again_writes_the_same_bytes_and_reading_gives_them_back(root: P
     before = set_path(root, "hybrid").read_bytes()
     assert locked(root).to_json() == lock.to_json()
     assert set_path(root, "hybrid").read_bytes() == before == lock.to_json()
-    assert ActionSetLock.from_json(before, name="hybrid", where="x").to_json() == before
+    assert ActionSetLock.from_json(before, name="hybrid", dataset=root, where="x").to_json() == before
     assert set_names(root) == ["hybrid"]
     set_path(root, "hybrid").unlink()
     locked(root)
@@ -113,7 +123,7 @@ def test_a_set_outlasts_new_episodes_and_a_split_that_grew(root: Path) -> None:
     add_episodes(root, *(replace(tagged(N + i), tags={"object": "gray"}) for i in range(6)))
     split(root)
     assert read_split(root).hash != lock.split_hash
-    assert check_set(root, "hybrid") == []
+    assert check_sets(root)["hybrid"][1] == []
     assert locked(root).to_json() == lock.to_json()
     assert len(lock_action_set(root, "hybrid", recipe(5), given="hybrid", redraw=True).sources[0].episodes) == 5
 
@@ -184,6 +194,18 @@ def validate_by_another_name(root: Path, lock: ActionSetLock) -> str:
     return f"episodes of it validate by another name\n   found: copy is {id}\n"
 
 
+def validate_under_other_pictures(root: Path, lock: ActionSetLock) -> str:
+    """A twin on the validation side, in a split that was drawn before there were any."""
+    store, id = EpisodeStore(root), min(lock.episodes)
+    store.write(twin(store, id, "purple"), Origin("test", "", "purple", "another key", {}))
+    store.write_index()
+    now = read_split(root)
+    assignment = {**now.assignment, "purple": "val"}
+    older = replace(now, assignment=assignment, hash=assignment_hash(assignment), twins={})  # type: ignore[arg-type]
+    write_atomic(lock_path(root), older.to_json())
+    return f"validation episodes have the same actions as episodes of it, step for step\n   found: purple does what {id} does\n"
+
+
 def edit_by_hand(root: Path, lock: ActionSetLock) -> str:
     table = json.loads(lock.to_json())
     table["sources"][0]["weight"] = 9
@@ -225,8 +247,8 @@ def forge_the_split_hash_too(root: Path, lock: ActionSetLock) -> str:
 
 
 WRONGS: list[Callable[[Path, ActionSetLock], str]] = [
-    vanish, trim, change, lose_actions, relabel, redraw, redraw_around_the_labels, validate_by_another_name, edit_by_hand,
-    forge, forge_with_care, forge_the_split_hash_too,
+    vanish, trim, change, lose_actions, relabel, redraw, redraw_around_the_labels, validate_by_another_name, validate_under_other_pictures,
+    edit_by_hand, forge, forge_with_care, forge_the_split_hash_too,
 ]  # fmt: skip
 
 
@@ -240,8 +262,70 @@ def test_a_set_that_does_not_hold_is_refused_wherever_it_is_read(
             read()
         assert said in f"{refused.value}\n"
         assert str(set_path(root, "hybrid")) in str(refused.value)
-        assert "vilp-data actions --recipe hybrid --redraw" in str(refused.value)
-    assert check_set(root, "hybrid")
+        assert f"vilp-data actions {root} --recipe hybrid --redraw" in str(refused.value)
+    assert check_sets(root)["hybrid"][1]
+
+
+def test_no_set_is_locked_that_would_not_hold(root: Path) -> None:
+    validating = read_split(root).ids("val")[0]
+    store = EpisodeStore(root)
+    for id in read_split(root).ids("train"):
+        store.write(twin(store, validating, id), Origin("test", "", id, f"key of {id}", {}))
+    store.write_index()
+    with pytest.raises(
+        ActionSetError, match=rf"found: {validating} does what e\d\d does\n(.|\n)*vilp-data split .* --redraw"
+    ):
+        lock_action_set(root, "all", recipe_from_dict({"source": {"all": {}}}, where="x"), given="x")
+    assert set_names(root) == []
+
+
+def test_a_trimmed_twin_is_known_by_what_it_was(root: Path) -> None:
+    store, split_now = EpisodeStore(root), read_split(root)
+    acting = {entry.id for entry in store.index() if entry.has_action}
+    labelled, validating = (next(id for id in split_now.ids(side) if id in acting) for side in ("train", "val"))
+    store.write(twin(store, labelled, validating), Origin("test", "", validating, f"key of {validating}", {}))
+    store.write_index()
+    trim_episodes(root, plan_trim(root, [labelled], steps=(2, None)))
+    hashes = twin_hashes(store, store.index(), None)
+    assert hashes[labelled] != hashes[validating]  # of what is left
+    assert twin_hashes(store, store.index(), split_now)[labelled] == hashes[validating]
+    assert any(finding.startswith("identical actions") for finding in check_dataset_split(root))
+    with pytest.raises(ActionSetError, match=f"{validating} does what {labelled} does"):
+        lock_action_set(root, "all", recipe_from_dict({"source": {"all": {}}}, where="x"), given="x")
+
+
+def test_twins_are_on_one_side_of_a_split_that_is_drawn(root: Path) -> None:
+    store = EpisodeStore(root)
+    add_episodes(root, *(replace(twin(store, f"e{number:02}", f"twin-{number:02}")) for number in range(4)))
+    for seed in range(8):
+        now = split(root, redraw=True, seed=seed)
+        assert all(now.assignment[f"e{number:02}"] == now.assignment[f"twin-{number:02}"] for number in range(4))
+        assert now.twin_groups == [[f"e{number:02}", f"twin-{number:02}"] for number in range(4)]
+    assert check_dataset_split(root) == []
+
+
+def test_commands_that_choose_anew_can_be_pasted_as_they_are(tmp_path: Path) -> None:
+    root = tmp_path / "my data"
+    write_dataset(root, *map(tagged, range(N)))
+    split(root, redraw=True)
+    lock = lock_action_set(root, "mine", recipe(), given="my recipes/mine.toml --preset tiny")
+    (note,) = remove_episodes(root, [min(lock.episodes)]).notes
+    with pytest.raises(ActionSetError) as refused:
+        read_action_set(root, "mine")
+    for said in (note, str(refused.value)):
+        command = said[said.index("`vilp-data actions") + 1 :].partition("`")[0]
+        assert shlex.split(command)[2:] == [
+            str(root), "--recipe", "my recipes/mine.toml", "--preset", "tiny", "--redraw"
+        ]  # fmt: skip
+
+
+def test_episodes_without_a_valid_step_give_no_labels(tmp_path: Path) -> None:
+    masked = [replace(tagged(n), id=f"masked{n}", valid=np.zeros(9 + n % 4, np.bool_)) for n in range(N)]
+    write_dataset(tmp_path, *map(tagged, range(N)), *(one for one in masked if one.action is not None))
+    split(tmp_path, redraw=True)
+    lock = lock_action_set(tmp_path, "all", recipe_from_dict({"source": {"all": {}}}, where="x"), given="x")
+    assert any(id.startswith("masked") for id in lock.video_only)
+    assert not any(id.startswith("masked") for id in lock.episodes)
 
 
 def test_surgery_names_the_sets_that_it_breaks_and_no_others(root: Path) -> None:
@@ -252,7 +336,7 @@ def test_surgery_names_the_sets_that_it_breaks_and_no_others(root: Path) -> None
     (note,) = remove_episodes(root, [labelled]).notes
     said = f"the action set 'mine' no longer holds: {labelled} gave it labels, and "
     assert note.startswith(said + "episodes of it are gone; `vilp-data undo`, or ")
-    assert "`vilp-data actions --recipe mine.toml --redraw`" in note
+    assert f"`vilp-data actions {root} --recipe mine.toml --redraw`" in note
     undo(root)
 
     (note,) = relabel_episodes(root, [labelled], labels={"object": "green"}).notes
@@ -278,7 +362,24 @@ def test_a_set_that_is_not_there_names_those_there_are(root: Path) -> None:
 
 def test_what_is_no_lock_is_refused_in_words(root: Path) -> None:
     locked(root)
-    for text in ("", "[]", '{"format": 9}', '{"format": 1}'):
+    good = set_path(root, "hybrid").read_text()
+
+    def changed(*path: str | int, to: Any) -> str:
+        table = json.loads(good)
+        inner = table
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = to
+        return json.dumps(table)
+
+    broken = [
+        "", "[]", '{"format": 9}', '{"format": 1}', "[" * 100_000, good.replace('"weight": 1', '"weight": 1e999', 1),
+        changed("action", "mean", 0, to=math.nan), changed("action", "sum_sq", 0, to=-1.0), changed("name", to="\ud800"),
+        changed("sources", 0, "effective_epochs", to="x"), changed("validation", to=[["e01"]]), changed("split_hash", to=3),
+        changed("sources", 0, "episodes", to="e01"), changed("episodes", "e01", to={"key": 3, "content": "x"}),
+        changed("recipe", "source", "gray", "count", to=True),
+    ]  # fmt: skip
+    for text in broken:
         set_path(root, "hybrid").write_text(text)
         with pytest.raises(ActionSetError, match="not the lock of an action set that can be read"):
             read_action_set(root, "hybrid")
@@ -302,6 +403,19 @@ def test_an_episode_outside_is_refused_before_its_file_is_touched(root: Path) ->
     disguised = replace(next(entry for entry in entries if entry.id not in inside), id=min(inside))
     with pytest.raises(ActionSetError, match="does not give"):
         labels.open_steps(disguised)
+
+
+def test_masked_steps_are_counted_through_the_set_too(root: Path) -> None:
+    locked(root)
+    labels, store = read_action_set(root, "hybrid"), EpisodeStore(root)
+    foreign = next(entry for entry in store.index() if entry.id not in labels.lock.episodes)
+    foreign = replace(foreign, n_valid=foreign.n_steps - 1)
+    store.steps_path(foreign.id).unlink()
+    opened = OpenEpisodes(
+        store, [labels.entries[0], foreign], latent_keys={}, frame_views=(), has_action=np.ones(2, np.bool_), labels=labels
+    )  # fmt: skip
+    with pytest.raises(ActionSetError, match=rf"does not give the actions of '{foreign.id}'"):
+        opened.valid_runs()
 
 
 def test_pairs_are_of_the_set_alone_each_as_often_as_its_source_weighs(root: Path) -> None:
@@ -343,6 +457,13 @@ def test_a_set_is_of_the_training_side(root: Path) -> None:
     for side in ("val", "all"):
         with pytest.raises(ActionSetError, match="are training episodes"):
             PairDataset(root, split=side, frame_stride=2, labels=labels)  # type: ignore[arg-type]
+
+
+def test_pairs_of_a_set_are_chosen_by_the_set_alone(root: Path) -> None:
+    locked(root)
+    labels = read_action_set(root, "hybrid")
+    with pytest.raises(UsageError, match=r"says itself which tags(.|\n)*purple"):
+        PairDataset(root, split="train", frame_stride=2, labels=labels, where={"object": "purple"})
 
 
 def test_latents_of_video_only_episodes_are_not_asked_for(root: Path) -> None:

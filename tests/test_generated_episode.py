@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +19,7 @@ from vilp_data.errors import StoreError, UsageError
 from vilp_data.generated_episode import (
     GeneratedEpisode,
     find_generated,
+    generated_name,
     generated_path,
     open_generated_episode,
     shown_frames,
@@ -110,6 +112,28 @@ def test_what_is_stale_is_refused_with_the_command_that_makes_it_again(
     assert str(refused.value).endswith(f"-> make it again: {command}")
     (reason,) = stale_generated(tmp_path).values()
     assert reason.endswith(command)
+
+
+def test_the_command_that_makes_it_again_can_be_pasted(tmp_path: Path) -> None:
+    store, made = generated_dataset(tmp_path / "my data")
+    words = ("--whole", "--vqgan", str(tmp_path / "it's a run"), "--episode", made.episode)
+    made = replace(made, maker=replace(made.maker, command=words))
+    write_generated_episode(store.root / "generated" / "planner-x", made, store.entry(made.episode))
+    trained_again(store, made.episode)
+    with pytest.raises(StoreError) as refused:
+        opened(store, made.episode)
+    command = str(refused.value).partition("make it again: ")[2]
+    assert shlex.split(command) == ["vilp-models", "generate", "--data", str(store.root), *words]
+
+
+def test_a_folder_is_found_by_what_it_is_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, _ = generated_dataset(tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    own, elsewhere = store.root / "generated" / "planner-x", tmp_path / "planner-x"
+    shutil.copytree(own, elsewhere)
+    assert generated_name(store.root, own) == "planner-x"
+    for folder in (own, elsewhere, Path("planner-x")):
+        assert find_generated(store.root, generated_name(store.root, folder)).samefile(folder)
 
 
 def test_an_episode_that_is_trained_on_since_is_refused(tmp_path: Path) -> None:

@@ -246,7 +246,7 @@ def test_gc_deletes_what_nothing_refers_to_and_says_how_much(root: Path, monkeyp
 
 
 def test_a_dry_run_of_gc_deletes_nothing_not_even_what_a_killed_writer_left(root: Path) -> None:
-    left = [EpisodeStore(root).steps_path("a").with_name(".x.safetensors.99.tmp"), root / "generated" / ".y.9.tmp"]
+    left = [EpisodeStore(root).steps_path("a").with_name(".x.safetensors.99.tmp"), root / "action_sets" / ".y.9.tmp"]
     for path in left:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"x" * 1000)

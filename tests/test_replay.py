@@ -62,6 +62,11 @@ def test_replay_gives_states_back_with_the_tagged_seed_and_angles_that_wrap(inte
     assert not report.proves(10.0)  # a tolerance that one step off would meet proves nothing
 
 
+def test_a_seed_that_is_none_is_not_handed_to_the_simulator(integrated):
+    named = replace(integrated, tags={"seed": "blue"}, state=integrated.state * [1, 1, 0] - [0, 0, 1])
+    assert replay(named, Integrator()).proves(1e-9)
+
+
 def test_an_episode_that_cannot_show_a_shift_neither_proves_nor_fails(integrated):
     """One step whose next action is the same: played a step early it is the same step."""
     short = replace(integrated, action=np.ones((2, 1), np.float32), state=integrated.state[:2])
@@ -143,7 +148,7 @@ def test_a_users_simulator_is_made_with_its_options_and_told_of_cameras_only_to_
     ("options", "cameras", "says"), [("", False, "cameras"), ("options = { gian = 2.0 }", True, "gian")]
 )
 def test_a_simulator_that_does_not_take_its_options_is_told_the_contract(task, options, cameras, says):
-    with pytest.raises(UsageError, match=rf"own: test/Own-v0 cannot be made(.|\n)*{says}(.|\n)*must take"):
+    with pytest.raises(UsageError, match=rf"test/Own-v0: the simulator does not take these options(.|\n)*{says}(.|\n)*must take"):
         make_env(task(Plain, options), cameras=cameras)
 
 

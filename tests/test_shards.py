@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from vilp_data import shards
 from vilp_data.errors import BusyError, StoreError
-from vilp_data.writer_lock import remove_leftovers, writer_lock
+from vilp_data.writer_lock import leftovers, remove_leftovers, writer_lock
 
 TENSORS = {
     "frames": np.arange(5 * 4 * 3, dtype=np.uint8).reshape(5, 4, 3),
@@ -133,16 +133,45 @@ def test_what_a_killed_writer_left_is_cleared_away(tmp_path: Path) -> None:
     assert not leftover.exists()
 
 
-def test_what_a_killed_recorder_or_trainer_left_goes_once_it_is_old(tmp_path: Path) -> None:
-    """They may be at work beside this lock, so a young file may still be theirs."""
-    old, young = tmp_path / "runs" / "vqgan" / ".a.safetensors.1.tmp", tmp_path / "logs" / ".b.mcap.2.tmp"
-    for leftover in (old, young):
+def test_what_was_left_by_those_who_write_without_the_lock_goes_once_it_is_old(tmp_path: Path) -> None:
+    """Recorders, trainers and `generate` may be at work, so a young file may still be theirs."""
+    old = tmp_path / "runs" / "vqgan" / ".a.safetensors.1.tmp"
+    young = [tmp_path / "logs" / ".b.mcap.2.tmp", tmp_path / "generated" / "planner" / ".c.safetensors.3.tmp"]
+    for leftover in (old, *young):
         leftover.parent.mkdir(parents=True)
         leftover.write_bytes(b"half")
     os.utime(old, (0, 0))
     remove_leftovers(tmp_path)
     assert not old.exists()
-    assert young.exists()
+    assert all(leftover.exists() for leftover in young)
+
+
+def test_a_folder_that_is_being_made_in_a_dataset_is_not_the_writers_to_clear_away(tmp_path: Path) -> None:
+    """A rollout or an export with its folder in the dataset holds a lock of its own, and clears away what a killed one left."""
+    for left in (tmp_path / ".run1.4242.tmp", tmp_path / "generated" / ".x.tmp", tmp_path / "runs" / ".y.tmp"):
+        left.mkdir(parents=True)
+        os.utime(left, (0, 0))
+    assert leftovers(tmp_path) == []
+    remove_leftovers(tmp_path)
+    assert (tmp_path / ".run1.4242.tmp").is_dir()
+
+
+def test_a_file_that_its_owner_renames_meanwhile_is_none_of_the_leftovers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / ".a.mcap.1.tmp").write_bytes(b"half")
+    listed = Path.glob
+
+    def glob(self: Path, pattern: str) -> list[Path]:
+        found = list(listed(self, pattern))
+        for path in found:
+            path.rename(path.with_name("a.mcap"))
+        return found
+
+    monkeypatch.setattr(Path, "glob", glob)
+    remove_leftovers(tmp_path)
+    assert [path.name for path in (tmp_path / "logs").iterdir()] == ["a.mcap"]
 
 
 def test_thousands_of_shards_open_under_a_low_descriptor_limit(shard: Path) -> None:

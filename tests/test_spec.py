@@ -9,7 +9,7 @@ import pytest
 from vilp_data import keys
 from vilp_data.errors import SpecError
 from vilp_data.spec import PRESETS
-from vilp_data.task_toml import load_task, parse_task, task_names
+from vilp_data.task_toml import load_task, parse_task, task_from_dict, task_names
 
 GOOD = 'name = "x"\n[views.front]\ntopic = "/a"\nheight = 8\nwidth = 8\n'
 
@@ -35,7 +35,9 @@ def test_every_built_in_task_is_valid_under_every_preset(task: str, preset: str 
         ("[presets.cppu]", "did you mean 'cpu'"),
         ("[record.variants.purple]\nepisodes = 3\noptoins = {}", "did you mean 'options'"),
         ("[record.variants.purple]\nepisodes = 3", "record.variants.purple.options"),
-        ("[record.variants.'a/b']\nepisodes = 3\noptions = {}", "part of a file's name"),
+        ("[record.variants.purple]\nepisodes = 3\noptions = {}", "record.variants.purple.first_seed"),
+        ("[presets]\ntiny = 3", "`presets.tiny` is a table"),
+        ("[record.variants.'a/b']\nepisodes = 3\nfirst_seed = 0\noptions = {}", "part of a file's name"),
         ("name = 3 = 4", "not valid TOML"),
     ],
 )
@@ -72,6 +74,49 @@ def test_a_variant_changes_options_of_the_simulator_and_keeps_the_others() -> No
     assert spec.sim.options == {"colour": "gray", "size": 3}
     with pytest.raises(SpecError, match="did you mean 'off_target'"):
         spec.simulated_as("of_target")
+
+
+def variant(name: str, first_seed: int, episodes: int = 10) -> str:
+    return f"[record.variants.{name}]\nepisodes = {episodes}\nfirst_seed = {first_seed}\noptions = {{}}\n"
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        (variant("a", 1000), r"\[record.variants.a\] and \[record\] (.|\n)*1000 to 1009 and 1000 to 1023(.|\n)*such as 1024"),
+        (variant("a", 1023), r"1023 to 1032 and 1000 to 1023"),
+        (variant("a", 991), r"991 to 1000 and 1000 to 1023"),
+        ("[record]\nepisodes = 5000\n" + variant("a", 5000), r"5000 to 5009 and 1000 to 5999(.|\n)*first_seed for"),
+        (variant("a", 5000) + variant("b", 5009), r"variants.a\] and \[record.variants.b\](.|\n)*such as 5019"),
+    ],
+)  # fmt: skip
+def test_episodes_that_are_told_apart_are_not_recorded_from_the_same_seeds(tables: str, said: str) -> None:
+    with pytest.raises(SpecError, match=rf"^task.toml: (.|\n)*{said}"):
+        parse_task(GOOD + tables, where="task.toml")
+
+
+def test_seeds_beside_each_other_are_apart_and_a_preset_counts_with_what_it_changes() -> None:
+    text = GOOD + variant("a", 990) + variant("b", 1024) + "[presets.paper.record]\nepisodes = 25\n"
+    assert parse_task(text, where="x").record.variants["b"].seeds == range(1024, 1034)
+    assert parse_task(text, where="x", preset="tiny").record.seeds == range(1000, 1024)
+    with pytest.raises(SpecError, match="1024 to 1033 and 1000 to 1024"):
+        parse_task(text, where="x", preset="paper")
+
+
+def test_a_dataset_of_a_task_whose_seeds_overlap_can_still_be_read() -> None:
+    table = parse_task(GOOD + variant("a", 5000), where="x").model_dump(mode="json", by_alias=True)
+    table["record"]["variants"]["a"]["first_seed"] = 1000
+    assert task_from_dict(table, where="dataset.json").record.variants["a"].first_seed == 1000
+
+
+@pytest.mark.parametrize("preset", [None, *PRESETS])
+@pytest.mark.parametrize("name", task_names())
+def test_no_built_in_task_records_the_starts_that_policies_are_tuned_and_judged_on(
+    name: str, preset: str | None
+) -> None:
+    record = load_task(name, preset=preset).record
+    for one in (record, *record.variants.values()):
+        assert not {*one.seeds} & {*range(50), *range(100_000, 100_050)}
 
 
 def test_the_order_of_an_action_s_parts_is_part_of_the_ingest_fields() -> None:

@@ -25,9 +25,16 @@ def sides(lock: SplitLock, episodes: list[SplitEpisode]) -> Counter[str]:
 
 
 def components(episodes: list[SplitEpisode]) -> list[set[str]]:
-    """Ids joined by equal groups or contents, merged until nothing changes: the slow reference."""
+    """Ids joined by equal groups, contents or twin hashes, merged until nothing changes: the slow reference."""
     joined = [
-        {e.id for e in episodes if e.group == o.group is not None or e.content_hash == o.content_hash} for o in episodes
+        {
+            e.id
+            for e in episodes
+            if e.group == o.group is not None
+            or e.content_hash == o.content_hash
+            or e.twin_hash == o.twin_hash is not None
+        }
+        for o in episodes
     ]
     while True:
         for a, b in combinations(joined, 2):
@@ -40,7 +47,7 @@ def components(episodes: list[SplitEpisode]) -> list[set[str]]:
 
 @st.composite
 def episode_sets(draw: st.DrawFn) -> list[SplitEpisode]:
-    """2 to 24 episodes with clashing groups, contents and strata, that are not all one component."""
+    """2 to 24 episodes with clashing groups, contents, twins and strata, that are not all one component."""
     count = draw(st.integers(2, 24))
     grouped = draw(st.booleans())
     episodes = [
@@ -49,6 +56,7 @@ def episode_sets(draw: st.DrawFn) -> list[SplitEpisode]:
             content_hash=f"c{draw(st.integers(0, 30))}",
             group=f"g{draw(st.integers(0, 12))}" if grouped else None,
             strata=(draw(st.sampled_from("xyz")),),
+            twin_hash=draw(st.none() | st.integers(0, 30).map("t{}".format)),
         )
         for i in range(count)
     ]
@@ -219,12 +227,39 @@ def test_check_reports_unassigned_episodes() -> None:
     assert check_split(lock, plain(12)) == ["episode-010, episode-011 without a side: run `vilp-data split`"]
 
 
-@pytest.mark.parametrize("what", ["group", "identical content"])
+def test_twins_follow_each_other_also_where_one_has_vanished() -> None:
+    known = [dataclasses.replace(e, twin_hash=f"actions-{e.id}") for e in plain(20)]
+    lock = draw_split(known, ratio=0.5, seed=0)
+    assert lock.assignment == draw_split(plain(20), ratio=0.5, seed=0).assignment  # no two of them are twins
+    for original in known:
+        twin = SplitEpisode("twin", content_hash="other pictures", twin_hash=original.twin_hash)
+        for there in (known, [e for e in known if e is not original]):
+            after = draw_split([*there, twin], ratio=0.5, seed=0, previous=lock)
+            assert after.assignment["twin"] == lock.assignment[original.id]
+            assert after.twin_groups == [[original.id, "twin"]]
+            assert after.duplicates == ()
+
+
+def test_twins_that_an_older_split_put_on_both_sides_stay_and_are_told() -> None:
+    lock = draw_split(plain(10), ratio=0.5, seed=0)
+    assert b"twins" not in lock.to_json()
+    train, val = lock.ids("train")[0], lock.ids("val")[0]
+    twins = [dataclasses.replace(e, twin_hash="same" if e.id in (train, val) else None) for e in plain(10)]
+    told = [f"identical actions 'same' on both sides: {train} in training, {val} in validation"]
+    assert check_split(lock, twins) == told
+    after = draw_split(twins, ratio=0.5, seed=0, previous=lock)
+    assert (after.assignment, after.hash) == (lock.assignment, lock.hash)
+    assert check_split(after, plain(10)) == told  # it remembers
+    apart = draw_split(twins, ratio=0.5, seed=0, previous=lock, redraw=True)
+    assert apart.assignment[train] == apart.assignment[val]
+
+
+@pytest.mark.parametrize("what", ["group", "identical content", "identical actions"])
 def test_check_reports_leaks(what: str) -> None:
     lock = draw_split(plain(10), ratio=0.5, seed=0)
     train, val = lock.ids("train")[0], lock.ids("val")[0]
-    change = {"group": "both"} if what == "group" else {"content_hash": "both"}
-    episodes = [dataclasses.replace(e, **change) if e.id in (train, val) else e for e in plain(10)]
+    fields = {"group": "group", "identical content": "content_hash", "identical actions": "twin_hash"}
+    episodes = [dataclasses.replace(e, **{fields[what]: "both"}) if e.id in (train, val) else e for e in plain(10)]
     assert check_split(lock, episodes) == [f"{what} 'both' on both sides: {train} in training, {val} in validation"]
 
 

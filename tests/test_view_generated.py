@@ -180,6 +180,21 @@ def test_every_action_has_its_error(tmp_path: Path) -> None:
     assert [float(row[1]) for row in errors] == [0.5] * made.action.shape[1]
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_nothing_is_known_of_is_a_dash(tmp_path: Path) -> None:
+    store, made = generated_dataset(tmp_path / "data")
+    psnr = {kind: {view: np.full_like(of, np.nan) for view, of in m.items()} for kind, m in made.psnr_db.items()}
+    unknown = replace(made, action=np.full_like(made.action, np.nan), psnr_db=psnr)
+    write_generated_page(tmp_path / "a.html", store, unknown)
+    page = (tmp_path / "a.html").read_text(encoding="utf-8")
+    rows = [re.findall(r"<td>([^<]*)</td>", row) for row in re.findall(r"<tr[^>]*>(.*?)</tr>", page)]
+    errors = [row[1:] for row in rows if len(row) == 4]
+    assert errors == [["–", "–", "0"]] * made.action.shape[1]
+    assert ["all", "5", "–", "–", "0.420", "0.220"] in rows
+    assert "<b>–</b>dB PSNR, imagined" in page
+    assert "nan" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", page)
+
+
 # --- the command -------------------------------------------------------------------------------------------------------
 
 

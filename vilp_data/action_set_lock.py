@@ -7,6 +7,8 @@ of, so the file alone shows that no validation episode is among the labels. `che
 from __future__ import annotations
 
 import json
+import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +17,7 @@ from vilp_data.action_sets import ActionRecipe, recipe_from_dict
 from vilp_data.episode_entry import EpisodeEntry
 from vilp_data.errors import ActionSetError, SpecError, StoreError
 from vilp_data.keys import digest, ingest_key
+from vilp_data.spec import PRESETS
 from vilp_data.split_lock import Side, SplitLock, assignment_hash
 from vilp_data.stats import ChannelStats
 
@@ -116,38 +119,87 @@ class ActionSetLock:
         }
 
     @classmethod
-    def from_json(cls, data: bytes, *, name: str, where: object) -> ActionSetLock:
-        """Read the lock of the set `name` back. ActionSetError where it is no lock, of another format version, or lacks a key.
+    def from_json(cls, data: bytes, *, name: str, dataset: object, where: object) -> ActionSetLock:
+        """Read the lock of the set `name` of the folder `dataset` back. ActionSetError where it is no lock, of another format version,
+        lacks a key, or holds what no lock can: text for a number, or a number that is none.
 
         One that was changed by hand is read as it stands: `check_action_set` tells."""
         try:
-            table = json.loads(data)
+            table = json.loads(data, parse_constant=_finite, parse_float=_finite)
             if not isinstance(table, dict):
                 raise TypeError(f"a {type(table).__name__}, not a table")
             if table["format"] != LOCK_FORMAT:
                 raise ValueError(f"format {table['format']!r}, this is {LOCK_FORMAT}")
-            return cls(
-                name=str(table["name"]),
-                given=str(table["given"]),
+            lock = cls(
+                name=_text(table["name"]),
+                given=_text(table["given"]),
                 recipe=recipe_from_dict(table["recipe"], where=str(where)),
-                sources=tuple(
-                    LockedSource(**{**source, "episodes": tuple(source["episodes"])}) for source in table["sources"]
-                ),
-                episodes={str(id): LockedEpisode(**episode) for id, episode in table["episodes"].items()},
-                video_only=tuple(table["video_only"]),
-                validation=tuple(table["validation"]),
-                split_hash=str(table["split_hash"]),
-                action=ChannelStats.from_json(json.dumps(table["action"]).encode(), where=where)[0],
-                seal=str(table["seal"]),
+                sources=tuple(map(_source, table["sources"])),
+                episodes={
+                    id: LockedEpisode(**{field: _text(value) for field, value in episode.items()})
+                    for id, episode in table["episodes"].items()
+                },
+                video_only=_ids(table["video_only"]),
+                validation=_ids(table["validation"]),
+                split_hash=_text(table["split_hash"]),
+                action=_stats(table["action"], where),
+                seal=_text(table["seal"]),
             )
-        except (KeyError, TypeError, ValueError, AttributeError, SpecError, StoreError) as error:
-            remedy = f"restore the file from a backup, or choose the set anew with `vilp-data actions --recipe {name} --redraw`"
+            lock.sealed().to_json()  # what cannot be written never was: numbers that are none, text that is no UTF-8
+            return lock
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError, SpecError, StoreError) as error:
+            remedy = f"restore the file from a backup, or choose the set anew with `{actions_command(dataset, name, '--redraw')}`"
             raise ActionSetError(
                 "not the lock of an action set that can be read",
                 where=where,
                 found=_unread(error),
                 remedy=f"{remedy} ({name}.toml, where it was chosen by a file)",
             ) from error
+
+
+def actions_command(dataset: object, recipe: str, *options: str) -> str:
+    """The whole command that locks a set of the folder `dataset`, to be pasted into a shell."""
+    return shlex.join(["vilp-data", "actions", str(dataset), "--recipe", recipe, *options])
+
+
+def redraw_command(lock: ActionSetLock, dataset: object) -> str:
+    """The command that chooses the set anew, by the recipe and preset that it was chosen by."""
+    recipe, _, preset = lock.given.rpartition(" --preset ")
+    named = (recipe, "--preset", preset) if recipe and preset in PRESETS else (lock.given,)
+    return actions_command(dataset, *named, "--redraw")
+
+
+def _source(table: Mapping[str, Any]) -> LockedSource:
+    for field, kind in (("weight", int), ("n_steps", int), ("effective_epochs", int | float)):
+        if not isinstance(table[field], kind):
+            raise TypeError(f"{field} {table[field]!r} of a source")
+    return LockedSource(**{**table, "name": _text(table["name"]), "episodes": _ids(table["episodes"])})
+
+
+def _stats(table: object, where: object) -> ChannelStats:
+    stats = ChannelStats.from_json(json.dumps(table).encode(), where=where)[0]
+    if stats.count < 1 or (stats.sum_sq < 0).any():
+        raise ValueError("statistics that no actions have")
+    return stats
+
+
+def _ids(values: object) -> tuple[str, ...]:
+    if not isinstance(values, list):
+        raise TypeError(f"{values!r} where a list of episodes belongs")
+    return tuple(map(_text, values))
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} where a text belongs")
+    return value
+
+
+def _finite(text: str) -> float:
+    """Of JSON's numbers and of what Python takes for one. ValueError for NaN and infinities, as which 1e999 is read, too."""
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"{text}, which is no number")
+    return value
 
 
 def _unread(error: Exception) -> str:
@@ -157,14 +209,21 @@ def _unread(error: Exception) -> str:
 
 
 def check_action_set(
-    lock: ActionSetLock, split: SplitLock, entries: Sequence[EpisodeEntry], *, where: object
+    lock: ActionSetLock,
+    split: SplitLock,
+    entries: Sequence[EpisodeEntry],
+    *,
+    twins: Mapping[str, str],
+    dataset: object,
+    where: object,
 ) -> Iterator[ActionSetError]:
     """Everything that is wrong with a lock for the split and the stored episodes of today; nothing where it holds.
 
     It holds where the file is as it was written, where its own lists prove that no validation episode gives labels, where the split
     still has every episode on the side that it had (it may have grown), and where every episode of the set is stored, unchanged,
-    with actions, with the tags that its source asks for, and not among those that validate by another name."""
-    again = f"choose anew with `vilp-data actions --recipe {lock.given} --redraw`, and train again"
+    with actions, with the tags that its source asks for, not among those that validate by another name, and twin of none of them: `twins`
+    are the hashes (`twins.twin_hashes`) of the stored episodes that are labelled or validate. `dataset` is the folder, `where` the lock."""
+    again = f"choose anew with `{redraw_command(lock, dataset)}`, and train again"
 
     def wrong(what: str, found: Sequence[str] | str, remedy: str) -> ActionSetError:
         words = found if isinstance(found, str) else _listed(found)
@@ -206,6 +265,13 @@ def check_action_set(
         yield wrong(
             "episodes of it validate by another name", leaked, f"take the copies out (`vilp-data remove`), or {again}"
         )
+    elif doubled := _twins(lock, twins, validating):
+        yield wrong(
+            "validation episodes have the same actions as episodes of it, step for step",
+            doubled,
+            f"take one of each two out (`vilp-data remove`), or draw a split that keeps them on one side "
+            f"(`{shlex.join(['vilp-data', 'split', str(dataset), '--redraw'])}`) and {again}",
+        )
 
 
 def _own_proof(lock: ActionSetLock) -> Iterator[tuple[str, str]]:
@@ -236,6 +302,12 @@ def _leaks(lock: ActionSetLock, stored: Mapping[str, EpisodeEntry], validating: 
     contents = {stored[id].ingest_content: id for id in lock.episodes if id in stored}
     found = ((entry.id, keys.get(entry.ingest_key) or contents.get(entry.ingest_content)) for entry in validating)
     return [f"{id} is {labelled}" for id, labelled in found if labelled is not None]
+
+
+def _twins(lock: ActionSetLock, twins: Mapping[str, str], validating: Sequence[EpisodeEntry]) -> list[str]:
+    labelled = {twins[id]: id for id in lock.episodes if id in twins}
+    found = ((entry.id, labelled.get(twins.get(entry.id, ""))) for entry in validating)
+    return [f"{id} does what {one} does" for id, one in found if one is not None]
 
 
 def _listed(items: Sequence[str], limit: int = 5) -> str:

@@ -24,7 +24,7 @@ _VALUES_SHOWN = 5
 
 
 class SourceRecipe(BaseModel):
-    """[source.NAME]: some of the training episodes that have actions.
+    """[source.NAME]: some of the training episodes that have actions, and a valid step.
 
     where   tag = "value", or a list of values; an episode must fit every tag. Empty: any episode
     where_not
@@ -38,9 +38,9 @@ class SourceRecipe(BaseModel):
 
     where: dict[str, tuple[str, ...]] = {}
     where_not: dict[str, tuple[str, ...]] = {}
-    count: int | None = Field(default=None, gt=0)
-    weight: int = Field(default=1, gt=0)
-    seed: int = Field(default=0, ge=0)
+    count: int | None = Field(default=None, gt=0, strict=True)
+    weight: int = Field(default=1, gt=0, strict=True)
+    seed: int = Field(default=0, ge=0, strict=True)
 
     @field_validator("where", "where_not", mode="before")
     @classmethod
@@ -77,7 +77,7 @@ class ActionRecipe(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: dict[str, SourceRecipe]
-    video: int | None = Field(default=None, gt=0)
+    video: int | None = Field(default=None, gt=0, strict=True)
 
     @model_validator(mode="after")
     def _some_source(self) -> Self:
@@ -93,15 +93,28 @@ class Candidate:
     id: str
     tags: Mapping[str, str]
     has_action: bool
+    n_valid: int
+
+    @property
+    def gives_labels(self) -> bool:
+        """Whether there is anything to learn from it."""
+        return self.has_action and self.n_valid > 0
 
 
 def parse_recipe(text: str, *, where: str, preset: str | None = None) -> ActionRecipe:
     """The recipe in a TOML, with the overrides of its [presets.PRESET]. Raises SpecError that names `where`, the key and the nearest
-    known one."""
+    known one, for any of its presets too."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SpecError("not valid TOML", where=where, found=str(error), remedy="correct that line") from error
+    plain = recipe_from_dict(with_preset(dict(table), None, where=where), where=where)
+    for name in table.get("presets", {}):
+        inside = f"{where}, [presets.{name}]"
+        changed = recipe_from_dict(with_preset(dict(table), name, where=where), where=inside)
+        if strangers := [source for source in changed.source if source not in plain.source]:
+            what = f"it has no source {strangers[0]!r} for a preset to change"
+            raise SpecError(what, where=inside, remedy=nearest(strangers[0], plain.source))
     return recipe_from_dict(with_preset(table, preset, where=where), where=where)
 
 
@@ -126,7 +139,7 @@ def choose(recipe: ActionRecipe, episodes: Sequence[Candidate], *, where: object
     chosen = {}
     for name, source in recipe.source.items():
         fitting = [episode for episode in episodes if source.fits(episode.tags)]
-        free = [episode for episode in fitting if episode.has_action and episode.id not in taken]
+        free = [episode for episode in fitting if episode.gives_labels and episode.id not in taken]
         if len(free) < (source.count or 1):
             raise _too_few(name, source, episodes, fitting, len(free), where=where)
         ranked = sorted(free, key=lambda episode: (_rank(source.seed, episode.id), episode.id))
@@ -181,9 +194,11 @@ def _too_few(
                 what, where=where, found=found, remedy=f"record or ingest such ones; {label}; or {by_others}"
             )
     mute = sum(not episode.has_action for episode in fitting)
-    taken = len(fitting) - mute - n_free
+    masked = sum(episode.has_action and not episode.gives_labels for episode in fitting)
+    taken = len(fitting) - mute - masked - n_free
     found = f"{n_free} of {len(episodes)} training episodes with {source}"
     found += f"; {mute} more have no actions" if mute else ""
+    found += f"; {masked} more have no valid step" if masked else ""
     found += f"; {taken} more are in a source before" if taken else ""
     wanted = f"{source.count} episodes" if source.count else "one episode"
     remedy = "record or ingest more (validation episodes give no labels)"

@@ -21,7 +21,7 @@ from vilp_data.dataset_split import side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import NoWindowError
 from vilp_data.labelled_episodes import LabelledEpisodes
-from vilp_data.open_episodes import OpenEpisodes, valid_runs
+from vilp_data.open_episodes import OpenEpisodes
 from vilp_data.spec import WindowSpec
 from vilp_data.types import I64
 
@@ -93,7 +93,7 @@ class WindowDataset(Dataset[WindowTensors]):
             has_action=self._has_action,
             labels=labels,
         )
-        episode, runs = valid_runs(store, self._entries)
+        episode, runs = self._episodes.valid_runs()
         starts = windows.plan_windows(
             runs,
             self._n_steps[episode],

@@ -20,6 +20,7 @@ from vilp_data.errors import SplitError
 from vilp_data.removed import read_removed
 from vilp_data.split import RatioOrigin, SplitEpisode, check_split, draw_split
 from vilp_data.split_lock import Side, SplitLock, assignment_hash
+from vilp_data.twins import twin_hashes
 from vilp_data.types import is_rollout
 from vilp_data.writer_lock import writer_lock
 
@@ -78,7 +79,7 @@ def update_split(
     with writer_lock(root):
         previous = _earlier_split(root, redraw=redraw)
         lock = draw_split(
-            list(split_episodes(EpisodeStore(root), group_by, strata)),
+            list(split_episodes(EpisodeStore(root), group_by, strata, known=previous)),
             ratio=ratio,
             seed=seed,
             ratio_from=ratio_from,
@@ -118,7 +119,7 @@ def check_dataset_split(root: Path) -> list[str]:
     lock = find_split(root)
     if lock is None:
         return ["no split yet: run `vilp-data split`"]
-    here = list(split_episodes(EpisodeStore(root), lock.group_by, lock.strata))
+    here = list(split_episodes(EpisodeStore(root), lock.group_by, lock.strata, known=lock))
     # What was removed on purpose is no finding: it keeps its side, should it come back.
     away = read_removed(root).keys() - {episode.id for episode in here}
     if away and lock.is_intact:
@@ -127,8 +128,10 @@ def check_dataset_split(root: Path) -> list[str]:
     return check_split(lock, here)
 
 
-def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str, ...]) -> Iterator[SplitEpisode]:
-    """What the split needs to know of each stored episode that is to have a side."""
+def split_episodes(
+    store: EpisodeStore, group_by: str | None, strata: tuple[str, ...], *, known: SplitLock | None = None
+) -> Iterator[SplitEpisode]:
+    """What the split needs to know of each stored episode that is to have a side. `known` is what it was told before."""
     for entry in store.index():
         if is_rollout(entry.tags):
             continue
@@ -143,6 +146,7 @@ def split_episodes(store: EpisodeStore, group_by: str | None, strata: tuple[str,
         yield SplitEpisode(
             id=entry.id,
             content_hash=entry.ingest_content,
+            twin_hash=twin_hashes(store, [entry], known).get(entry.id),
             group=entry.tags[group_by] if group_by else None,
             strata=tuple(entry.tags[tag] for tag in strata),
             thumbnails=_thumbnails(store, entry),

@@ -8,6 +8,7 @@ the viewer reads that from the dataset. Reconstructed frames are kept too, so th
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,6 +142,12 @@ def find_generated(root: Path, run: str) -> Path:
     return folder
 
 
+def generated_name(root: Path, folder: Path) -> str:
+    """What `find_generated` finds a folder by: its name under DATA/generated/, else its whole path."""
+    own = folder.resolve().parent == (root / "generated").resolve()
+    return folder.resolve().name if own else str(folder.resolve())
+
+
 def generated_ids(folder: Path) -> list[str]:
     """The episodes that a folder of generated ones has a file of, sorted."""
     return sorted(path.name.removesuffix(".safetensors") for path in folder.glob("[!.]*.safetensors"))
@@ -195,7 +202,8 @@ def open_generated_episode(store: EpisodeStore, folder: Path, episode_id: str) -
     maker = _maker(shard.metadata)
     why = _stale_reason(store, episode_id, shard.metadata, maker)
     if why is not None:
-        remedy = f"make it again: vilp-models generate --data {store.root} {' '.join(maker.command)}"
+        words = ["vilp-models", "generate", "--data", str(store.root), *maker.command]
+        remedy = f"make it again: {shlex.join(words)}"
         raise StoreError("made of something else than the dataset holds today", where=path, found=why, remedy=remedy)
     arrays = shard.arrays
     views = sorted(name.removeprefix("imagined/") for name in arrays if name.startswith("imagined/"))

@@ -105,8 +105,7 @@ class OpenEpisodes:
     def _open_episode(self, number: int) -> OpenEpisode:
         entry, store = self._entries[number], self._store
         views = dict.fromkeys((*self._latent_keys, *self._frame_views))
-        labels = self._labels
-        steps = open_steps(store, entry, views) if labels is None else labels.open_steps(entry, views)
+        steps = self._steps(entry, views)
         opened = OpenEpisode(
             source_index={view: steps[f"source_index/{view}"] for view in views},
             latents={view: open_latents(store.root, entry, view, key) for view, key in self._latent_keys.items()},
@@ -116,6 +115,21 @@ class OpenEpisodes:
         )
         self._require_shapes(entry, opened)
         return opened
+
+    def valid_runs(self) -> tuple[I64, I64]:
+        """The episode [R] of each run of valid steps int64 [R,2]; only episodes with invalid steps are opened for it."""
+        episode, runs = [], []
+        for number, entry in enumerate(self._entries):
+            found = [(0, entry.n_steps)]
+            if entry.n_valid < entry.n_steps:
+                found = [(first, end) for first, end in windows.valid_runs(self._steps(entry)["valid"]).tolist()]
+            episode += [number] * len(found)
+            runs += found
+        return np.array(episode, np.int64), np.array(runs, np.int64).reshape(-1, 2)
+
+    def _steps(self, entry: EpisodeEntry, views: Iterable[str] = ()) -> dict[str, npt.NDArray[Any]]:
+        """The only way to a steps file from here."""
+        return open_steps(self._store, entry, views) if self._labels is None else self._labels.open_steps(entry, views)
 
     def _shapes_from_headers(self) -> StepShapes:
         """From the first episode (for actions, the first that has them)."""
@@ -149,19 +163,6 @@ class OpenEpisodes:
                 found=f"{shapes} instead of {self.shapes}",
                 remedy="ingest every log with one task file, then run `vilp-data latents`",
             )
-
-
-def valid_runs(store: EpisodeStore, entries: Sequence[EpisodeEntry]) -> tuple[I64, I64]:
-    """The episode [R] of each run of valid steps int64 [R,2]; only episodes with invalid steps are opened for it."""
-    episode, runs = [], []
-    for number, entry in enumerate(entries):
-        found = [(0, entry.n_steps)]
-        if entry.n_valid < entry.n_steps:
-            valid = open_steps(store, entry)["valid"]
-            found = [(first, end) for first, end in windows.valid_runs(valid).tolist()]
-        episode += [number] * len(found)
-        runs += found
-    return np.array(episode, np.int64), np.array(runs, np.int64).reshape(-1, 2)
 
 
 def _require_view(root: Path, entries: Sequence[EpisodeEntry], view: str) -> None:

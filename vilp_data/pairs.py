@@ -19,9 +19,9 @@ from vilp_data import windows
 from vilp_data.batches import TensorBatch, allocated
 from vilp_data.dataset_split import side_episodes
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import StoreError
+from vilp_data.errors import StoreError, UsageError
 from vilp_data.labelled_episodes import LabelledEpisodes
-from vilp_data.open_episodes import OpenEpisodes, valid_runs
+from vilp_data.open_episodes import OpenEpisodes
 from vilp_data.types import I64
 
 
@@ -64,11 +64,14 @@ class PairDataset(Dataset[PairTensors]):
         """Open the dataset at `root`. `views` are those whose images are read, all of them for None; `latent_keys` names the
         encoder key of each view whose latents are read too, none for None. `labels` leaves an action set's episodes alone of the
         training side, and gives each of their pairs as many numbers as an epoch of the set goes over it. `where` leaves the
-        episodes of a side that have these tags.
+        episodes of a side that have these tags; an action set has its own, so it is not asked for beside `labels`.
 
-        Raises SplitError without a split that covers the episodes, and StoreError where no episode has actions or no pair
-        fits. What else is refused, and when, `open_episodes.OpenEpisodes` says.
+        Raises UsageError for both, SplitError without a split that covers the episodes, and StoreError where no episode has actions or
+        no pair fits. What else is refused, and when, `open_episodes.OpenEpisodes` says.
         """
+        if labels is not None and where:
+            remedy = "leave `where` out, or choose a set by these tags"
+            raise UsageError("an action set says itself which tags its episodes have", found=dict(where), remedy=remedy)
         store = EpisodeStore(Path(root))
         self._entries = _acting(store, split, where or {}) if labels is None else labels.of_side(split)
         self._frame_stride = frame_stride
@@ -81,7 +84,7 @@ class PairDataset(Dataset[PairTensors]):
             has_action=np.ones(len(self._entries), np.bool_),
             labels=labels,
         )
-        episode, runs = valid_runs(store, self._entries)
+        episode, runs = self._episodes.valid_runs()
         starts = windows.pair_windows(runs, frame_stride=frame_stride)
         if labels is not None:
             episode, starts = windows.repeated(episode, starts, labels.repeats())

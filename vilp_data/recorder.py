@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from vilp_data.errors import UsageError
 from vilp_data.shards import atomic_file
-from vilp_data.types import EPISODE_RECORD, U8
+from vilp_data.types import EPISODE_RECORD, MADE_FROM_RECORD, U8
 
 JPEG_QUALITY = 95
 CHUNK_BYTES = 512 * 1024
@@ -64,13 +64,18 @@ class EpisodeRecorder:
             log.image("/camera/front/image", stamp_ns, rgb)
             log.metadata["success"] = "true"
 
-    `metadata` becomes the metadata record `episode` and may be added to until the block ends. `seed` draws the latencies. Stamps
+    `metadata` becomes the metadata record `episode`, the episode's tags, and may be added to until the block ends; `made_from` becomes the
+    record `made_from`, which no dataset stores: by it a recorder knows its finished logs again. `seed` draws the latencies. Stamps
     are integer nanoseconds and may come in any order within `reorder_s`: messages are written in order of log time.
     StoreError where the file cannot be written.
     """
 
-    def __init__(self, path: Path, *, metadata: Mapping[str, str], seed: int = 0, reorder_s: float = 0.5) -> None:
+    def __init__(
+        self, path: Path, *, metadata: Mapping[str, str], made_from: Mapping[str, str] | None = None, seed: int = 0,
+        reorder_s: float = 0.5,
+    ) -> None:  # fmt: skip
         self.metadata = dict(metadata)
+        self._made_from = made_from
         self._path = path
         self._seed = seed
         self._reorder_ns = round(reorder_s * 1e9)
@@ -98,6 +103,8 @@ class EpisodeRecorder:
                 return
             self._write_pending(None)
             self._writer.add_metadata(EPISODE_RECORD, {name: self.metadata[name] for name in sorted(self.metadata)})
+            if self._made_from is not None:
+                self._writer.add_metadata(MADE_FROM_RECORD, dict(self._made_from))
             self._writer.finish()
 
     # --- one method for each kind of message ---

@@ -216,16 +216,39 @@ class VariantSpec(Frozen):
     their own: demonstrations off target."""
 
     episodes: int = Field(gt=0)
-    first_seed: int = Field(default=0, ge=0)
+    first_seed: int = Field(ge=0)
     options: dict[str, Any]
+
+    @property
+    def seeds(self) -> range:
+        return range(self.first_seed, self.first_seed + self.episodes)
 
 
 class RecordSpec(Frozen):
-    """How many episodes `record` makes, from which seed on; and of which variants of the task, by name."""
+    """How many episodes `record` makes, from which seed on; and of which variants of the task, by name. Policies are tuned and judged on
+    other seeds (0:50, 100000:100050), so that no start was trained on."""
 
     episodes: int = Field(default=24, gt=0)
-    first_seed: int = Field(default=0, ge=0)
+    first_seed: int = Field(default=1000, ge=0)
     variants: dict[str, VariantSpec] = {}
+
+    @property
+    def seeds(self) -> range:
+        return range(self.first_seed, self.first_seed + self.episodes)
+
+    def require_apart(self, variant: str | None, seeds: range, *, where: str) -> None:
+        """Raise SpecError where `seeds` for `variant` (None: the task itself) run into those of another part of this table. An expert draws
+        from the seed alone: two episodes of one seed may have the same actions, one of them in validation."""
+        parts: dict[str | None, range] = {None: self.seeds, **{name: one.seeds for name, one in self.variants.items()}}
+        for other, others in parts.items():
+            if other != variant and seeds.start < others.stop and others.start < seeds.stop:
+                free = max(part.stop for part in parts.values())
+                raise SpecError(
+                    f"{_part(variant)} and {_part(other)} would be recorded from the same seeds",
+                    where=where,
+                    found=f"{_shown(seeds)} and {_shown(others)}: one seed gives both the same start and the same actions",
+                    remedy=f"another first_seed for {_part(variant)}, such as {free}, or fewer episodes",
+                )
 
     @model_serializer(mode="wrap")
     def _with_variants_if_stated(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -238,6 +261,14 @@ class RecordSpec(Frozen):
             if not name.replace("_", "").isalnum():
                 raise ValueError(f"variant {name!r} becomes part of a file's name: letters, digits and _ only")
         return self
+
+
+def _part(variant: str | None) -> str:
+    return "[record]" if variant is None else f"[record.variants.{variant}]"
+
+
+def _shown(seeds: range) -> str:
+    return f"{seeds.start} to {seeds.stop - 1}"
 
 
 class TaskSpec(Frozen):

@@ -2,7 +2,7 @@
 
 A lock is a plain value: this module neither reads nor writes files. Three rules hold whatever the input:
 
-- Episodes of one group, and episodes of identical content, are on one side.
+- Episodes of one group, episodes of identical content, and twins (`twins`) are on one side.
 - What the lock has assigned stays assigned, for episodes that have vanished too: one that comes back, or comes back
   renamed, must not change sides, since a checkpoint may have trained on it.
 - Each side has at least one episode.
@@ -44,6 +44,7 @@ class SplitEpisode:
     content_hash  equal for two episodes exactly when they show the same thing
     group         value of the tag that the task groups by; None where it groups by nothing
     strata        values of the tags to spread evenly, in the task's order
+    twin_hash     equal for two episodes exactly when the same was done and measured in them, whatever they show; None without actions
     thumbnails    [..., 8, 8] grey levels (see `duplicates.thumbnails`) to find near-identical episodes by; or None
     """
 
@@ -51,6 +52,7 @@ class SplitEpisode:
     content_hash: str
     group: str | None = None
     strata: tuple[str, ...] = ()
+    twin_hash: str | None = None
     thumbnails: npt.NDArray[Any] | None = field(default=None, compare=False)
 
 
@@ -105,6 +107,7 @@ def draw_split(
         strata=strata,
         groups=(dict(locked.groups) if locked else {}) | {episode.id: _label(episode) for episode in episodes},
         contents=(dict(locked.contents) if locked else {}) | {episode.id: episode.content_hash for episode in episodes},
+        twins=(dict(locked.twins) if locked else {}) | _twins(episodes),
         duplicates=_duplicates(episodes),
         near_duplicates=_near_duplicates(episodes, assignment),
     )
@@ -113,8 +116,8 @@ def draw_split(
 def check_split(lock: SplitLock, episodes: Sequence[SplitEpisode]) -> list[str]:
     """What is wrong with a lock for the episodes at hand, one sentence each; empty when nothing is.
 
-    Looks for a changed assignment, episodes without a side, episodes that the lock knows and the dataset lacks, a group
-    or identical content on both sides, an empty side, and a validation share further from the ratio than whole groups
+    Looks for a changed assignment, episodes without a side, episodes that the lock knows and the dataset lacks, a group,
+    identical content or twins on both sides, an empty side, and a validation share further from the ratio than whole groups
     force it to be.
     """
     findings = []
@@ -146,12 +149,12 @@ class _Group:
 
 
 def _joined(episodes: Sequence[SplitEpisode], locked: SplitLock | None) -> list[_Group]:
-    """Connected components over equal groups and equal contents, vanished episodes included, sorted by key."""
+    """Connected components over equal groups, equal contents and twins, vanished episodes included, sorted by key."""
     present = {episode.id: episode for episode in episodes}
     vanished = sorted(set(locked.assignment) - set(present)) if locked else []
-    links = {episode.id: (_label(episode), episode.content_hash) for episode in episodes}
+    links = {episode.id: (_label(episode), episode.content_hash, episode.twin_hash) for episode in episodes}
     if locked:
-        links |= {id: (locked.groups.get(id, id), locked.contents.get(id, "")) for id in vanished}
+        links |= {id: (locked.groups.get(id, id), locked.contents.get(id, ""), locked.twins.get(id)) for id in vanished}
 
     root: dict[tuple[str, str], tuple[str, str]] = {}
 
@@ -162,8 +165,9 @@ def _joined(episodes: Sequence[SplitEpisode], locked: SplitLock | None) -> list[
             node = root[node]
         return node
 
-    for id, (label, content) in links.items():
+    for id, (label, content, twin) in links.items():
         root[find(("group", label))] = find(("content", content or id))
+        root[find(("group", label))] = find(("twin", twin or id))
     members: dict[tuple[str, str], list[str]] = defaultdict(list)
     for id in sorted(links):
         members[find(("group", links[id][0]))].append(id)
@@ -192,7 +196,7 @@ def _newcomers_of_known_groups(groups: Iterable[_Group], known: Mapping[str, Sid
             raise SplitError(
                 "a new episode belongs with episodes on both sides",
                 where=_listed(new),
-                found=f"same group or content as {_listed([id for id in members if id in known])}",
+                found=f"same group, content or actions as {_listed([id for id in members if id in known])}",
                 remedy="take the new episode out, or draw a new split with `vilp-data split --redraw`",
             )
         if sides:
@@ -319,6 +323,10 @@ def _duplicates(episodes: Iterable[SplitEpisode]) -> tuple[tuple[str, ...], ...]
     return tuple(sorted(tuple(sorted(ids)) for ids in same.values() if len(ids) > 1))
 
 
+def _twins(episodes: Iterable[SplitEpisode]) -> dict[str, str]:
+    return {episode.id: episode.twin_hash for episode in episodes if episode.twin_hash is not None}
+
+
 def _near_duplicates(episodes: Sequence[SplitEpisode], assignment: Mapping[str, Side]) -> tuple[NearDuplicate, ...]:
     content = {episode.id: episode.content_hash for episode in episodes}
     pairs = near_duplicates({episode.id: episode.thumbnails for episode in episodes if episode.thumbnails is not None})
@@ -328,11 +336,12 @@ def _near_duplicates(episodes: Sequence[SplitEpisode], assignment: Mapping[str, 
 
 
 def leaks(lock: SplitLock, episodes: Sequence[SplitEpisode]) -> list[str]:
-    """Groups and contents on both sides, among the episodes at hand and those the lock remembers."""
+    """Groups, contents and twins on both sides, among the episodes at hand and those the lock remembers."""
     groups = dict(lock.groups) | {episode.id: _label(episode) for episode in episodes}
     contents = dict(lock.contents) | {episode.id: episode.content_hash for episode in episodes}
+    twins = dict(lock.twins) | _twins(episodes)
     findings = []
-    for what, labels in (("group", groups), ("identical content", contents)):
+    for what, labels in (("group", groups), ("identical content", contents), ("identical actions", twins)):
         sides: dict[str, dict[Side, list[str]]] = defaultdict(lambda: defaultdict(list))
         for id, side in sorted(lock.assignment.items()):
             if id in labels:

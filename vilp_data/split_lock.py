@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from vilp_data.duplicates import NearDuplicate
@@ -26,6 +27,7 @@ class SplitLock:
     ratio            share of training episodes aimed at; `ratio_from` says whether the task or the command line set it
     groups           episode id -> its group (its own id where the task groups by nothing)
     contents         episode id -> content hash, so that a renamed copy of a vanished episode is known again
+    twins            the same for what was done and measured without the pictures (`twins.twin_hash`), of episodes that have actions
     duplicates       ids with identical content, each list sorted
     near_duplicates  closest first, pairs across the two sides before the others; reported, never moved
     """
@@ -39,12 +41,21 @@ class SplitLock:
     strata: tuple[str, ...]
     groups: Mapping[str, str]
     contents: Mapping[str, str]
+    twins: Mapping[str, str] = field(default_factory=dict)
     duplicates: tuple[tuple[str, ...], ...] = ()
     near_duplicates: tuple[NearDuplicate, ...] = ()
 
     def ids(self, side: Side) -> list[str]:
         """Episodes on one side, sorted."""
         return sorted(id for id, assigned in self.assignment.items() if assigned == side)
+
+    @property
+    def twin_groups(self) -> list[list[str]]:
+        """Episodes of the same actions and low_dim whose contents differ all the same, group by group, sorted."""
+        same: dict[str, list[str]] = defaultdict(list)
+        for id, twin in sorted(self.twins.items()):
+            same[twin].append(id)
+        return [ids for ids in same.values() if len({self.contents.get(id, id) for id in ids}) > 1]
 
     @property
     def is_intact(self) -> bool:
@@ -63,6 +74,7 @@ class SplitLock:
             "assignment": dict(self.assignment),
             "groups": dict(self.groups),
             "contents": dict(self.contents),
+            **({"twins": dict(self.twins)} if self.twins else {}),
             "duplicates": [list(ids) for ids in self.duplicates],
             "near_duplicates": [[pair.first, pair.second, pair.distance] for pair in self.near_duplicates],
         }
@@ -86,8 +98,9 @@ class SplitLock:
                 ratio_from=_one_of(RatioOrigin, table["ratio_from"]),
                 group_by=table["group_by"],
                 strata=tuple(table["strata"]),
-                groups=dict(table["groups"]),
-                contents=dict(table["contents"]),
+                groups=_texts(table["groups"]),
+                contents=_texts(table["contents"]),
+                twins=_texts(table.get("twins", {})),  # locks of before there were any hold none
                 duplicates=tuple(tuple(ids) for ids in table["duplicates"]),
                 near_duplicates=tuple(NearDuplicate(*pair) for pair in table["near_duplicates"]),
             )
@@ -101,6 +114,10 @@ class SplitLock:
 def assignment_hash(assignment: Mapping[str, Side]) -> str:
     """SHA-256 of an assignment, independent of its order: what checkpoints carry."""
     return hashlib.sha256(json.dumps(dict(assignment), sort_keys=True).encode()).hexdigest()
+
+
+def _texts(table: Mapping[str, object]) -> dict[str, str]:
+    return {id: str(value) for id, value in table.items()}
 
 
 def _one_of(choices: Any, value: object) -> Any:

@@ -70,20 +70,30 @@ def task_names() -> list[str]:
 
 
 def parse_task(text: str, *, where: str, preset: str | None = None) -> TaskSpec:
-    """Parse a task TOML. `[presets.NAME]` tables override the rest, table by table; SpecError says what and where."""
+    """Parse a task TOML. `[presets.NAME]` tables override the rest, table by table; SpecError says what and where, also where episodes
+    that are told apart would be recorded from the same seeds: a dataset that holds such ones can still be read."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SpecError("not valid TOML", where=where, found=str(error), remedy="correct that line") from error
-    return _validated(with_preset(table, preset, where=where), where)
+    task = _validated(with_preset(table, preset, where=where), where)
+    for name, variant in task.record.variants.items():
+        task.record.require_apart(name, variant.seeds, where=where)
+    return task
 
 
 def with_preset(table: dict[str, Any], preset: str | None, *, where: str) -> dict[str, Any]:
-    """A TOML without its `[presets]`, those of `preset` in place of what they override. SpecError for a name that is none."""
+    """A TOML without its `[presets]`, those of `preset` in place of what they override. SpecError for what is none."""
     presets = table.pop("presets", {})
-    for name in presets:
+    if not isinstance(presets, dict):
+        raise SpecError("`presets` holds tables", where=where, found=presets, remedy="such as [presets.tiny.record]")
+    for name, over in presets.items():
         if name not in PRESETS:
             raise SpecError(f"unknown preset [presets.{name}]", where=where, remedy=nearest(name, PRESETS))
+        if not isinstance(over, dict):
+            raise SpecError(
+                f"`presets.{name}` is a table", where=where, found=over, remedy=f"such as [presets.{name}.…]"
+            )
     if preset is None:
         return table
     if preset not in PRESETS:

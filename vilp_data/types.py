@@ -39,6 +39,9 @@ ColumnNames: TypeAlias = Mapping[str, Mapping[str, Sequence[str]]]
 EPISODE_RECORD = "episode"
 """Name of the metadata record in which a log says what it shows (task, seed, success, …): it becomes the episode's tags."""
 
+MADE_FROM_RECORD = "made_from"
+"""Name of the metadata record by which a recorder knows its finished logs again. No dataset stores it."""
+
 ROLLOUT_TAG = ("source", "rollout")
 """The tag of an episode that a policy under trial made. Demonstrations (people's, scripted experts') do not bear it."""
 

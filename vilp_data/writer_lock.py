@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,8 +16,8 @@ from vilp_data.errors import BusyError, StoreError
 WAIT_S = 10.0
 """How long a reader waits for another process to finish its renames: these take milliseconds."""
 
-_OWN = ("", "episodes", "latents", "action_sets", "history", "generated")
-_SHARED = ("logs", "runs")
+_OWN = ("", "episodes", "latents", "action_sets", "history")
+_SHARED = ("logs", "runs", "generated")
 _LEFTOVER_AGE_S = 3600.0
 
 
@@ -65,17 +66,25 @@ def await_settled(root: Path) -> None:
 
 def leftovers(root: Path) -> list[Path]:
     """Temporary files that a killed writer left of what the lock is for. Call inside `writer_lock(root)`."""
-    return [path for folder in _OWN for path in _temporary(root, folder)]
+    return [path for folder in _OWN for path, _ in _temporary(root, folder)]
 
 
 def remove_leftovers(root: Path) -> None:
-    """Delete them: whoever is about to write much makes room first. Recorders and trainers write into logs/ and runs/ without the lock:
-    there only what is old is surely nobody's."""
+    """Delete them: whoever is about to write much makes room first. Recorders, trainers and `generate` write into
+    logs/, runs/ and generated/ without the lock: there only what is old is surely nobody's."""
     oldest = time.time() - _LEFTOVER_AGE_S
-    others = [path for folder in _SHARED for path in _temporary(root, folder) if path.stat().st_mtime < oldest]
+    others = [path for folder in _SHARED for path, changed in _temporary(root, folder) if changed < oldest]
     for path in (*leftovers(root), *others):
         path.unlink(missing_ok=True)
 
 
-def _temporary(root: Path, folder: str) -> list[Path]:
-    return sorted((root / folder).glob("**/.*.tmp" if folder else ".*.tmp"))
+def _temporary(root: Path, folder: str) -> list[tuple[Path, float]]:
+    """Files, each with the time of its last change. Folders are others', who clear theirs away under locks of their own: see
+    `whole_folder`."""
+    found = []
+    for path in sorted((root / folder).glob("**/.*.tmp" if folder else ".*.tmp")):
+        with contextlib.suppress(FileNotFoundError):  # its owner was just done
+            status = path.stat()
+            if stat.S_ISREG(status.st_mode):
+                found.append((path, status.st_mtime))
+    return found

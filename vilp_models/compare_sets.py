@@ -1,9 +1,10 @@
 """Do other labels help? VILP, the oracle and BC trained on several action sets, each with several seeds, from the same starts.
 
     DATA/runs/policy-PRESET-SET-seedK, bc-PRESET-SET-seedK     what is trained
-    DATA/comparisons/PRESET-SET-SET-SEEDS/POLICY-SET-seedK     a rollout each (oracle-firstN: of N episodes); stay learns from nothing
-    DATA/comparisons/PRESET-SET-SET-SEEDS/report.json, report.md
-                                                               all of it, side by side
+    DATA/comparisons/PRESET-SET+SET-SEEDS-xN/POLICY-SET-seedK  a rollout each (oracle-firstN: of N episodes)
+    DATA/comparisons/PRESET-SET+SET-SEEDS-xN/stay, stay-val    the policy that learns from nothing, from the same starts
+    DATA/comparisons/PRESET-SET+SET-SEEDS-xN/report.json, report.md
+                                                               all of it, side by side; N training seeds
 
 The planner is one and the same for all: it learns from video alone. What is done already, and was made of what is there today, is kept,
 so that a comparison goes on where it stopped, and one of other starts or policies takes nothing away.
@@ -21,7 +22,7 @@ from vilp_data.action_set_lock import DIGITS, ActionSetLock
 from vilp_data.dataset_action_sets import read_action_set
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError, VilpDataError, nearest
-from vilp_data.spec import TaskSpec
+from vilp_data.spec import SimSpec, TaskSpec
 from vilp_models.checkpoint import read_state, run_folder
 from vilp_models.compare_sets_report import COMPARED, SetsReport
 from vilp_models.evaluate import evaluate_policy
@@ -33,7 +34,7 @@ from vilp_models.rollout_folder import find_rollout
 from vilp_models.rollout_report import roll_out_into
 from vilp_models.runs import default_run, find_model_run
 from vilp_models.simulator import Worlds, require_simulator
-from vilp_models.starts import Recording, Start, episode_starts, parse_seeds, seed_starts
+from vilp_models.starts import Recording, Start, episode_starts, parse_seeds, starts_digest, unseen_starts
 from vilp_models.train import train_bc, train_policy
 from vilp_models.trained import default_device
 
@@ -74,10 +75,14 @@ class SetsComparison:
     restart: bool = False
 
     def __post_init__(self) -> None:
-        if len(set(self.sets)) < 2:
+        if len(self.sets) < 2 or len(set(self.sets)) < len(self.sets):
             raise UsageError(
-                "a comparison needs two action sets", found=", ".join(self.sets), remedy="--sets small,hybrid"
+                "a comparison needs two action sets, none of them twice",
+                found=", ".join(self.sets),
+                remedy="--sets small,hybrid",
             )
+        if not self.policies:
+            raise UsageError("no policy to compare", remedy=f"--policies {','.join(COMPARED)}")
         for policy in self.policies:
             if policy not in COMPARED:
                 raise UsageError(f"{policy!r} learns from no action set", remedy=nearest(policy, COMPARED))
@@ -85,9 +90,8 @@ class SetsComparison:
     @property
     def folder(self) -> Path:
         """Where rollouts and report go."""
-        return (
-            self.root / "comparisons" / "-".join([self.preset or "default", *self.sets, self.seeds.replace(":", "-")])
-        )
+        parts = [self.preset or "default", "+".join(self.sets), self.seeds.replace(":", "-"), f"x{self.n_seeds}"]
+        return self.root / "comparisons" / "-".join(parts)
 
     def run(self, kind: str, action_set: str, seed: int) -> Path:
         """Where "policy" or "bc" is trained."""
@@ -97,14 +101,14 @@ class SetsComparison:
 
 @dataclass(frozen=True)
 class _Planned:
-    """A rollout as it is to be: of this policy, from these starts (`what` they are, in a word), for this many steps each."""
+    """A rollout as it is to be: of this policy, from these starts (`what` they are, in a word) in this simulator."""
 
     folder: Path
     name: str
     acting: Policy
     starts: Sequence[Start]
     what: str
-    max_steps: int
+    sim: SimSpec
 
     def found(self) -> dict[str, Any] | None:
         """The report.json of the one that is there; None where there is none, or it is another."""
@@ -114,11 +118,15 @@ class _Planned:
         made_of = (
             there["tags"],
             there.get("n_action_steps"),
-            [e["name"] for e in there["episodes"]],
+            there.get("starts_sha256"),
             there["max_steps"],
         )
-        names = [start.name for start in self.starts]
-        return there if made_of == (dict(self.acting.tags), self.acting.n_action_steps, names, self.max_steps) else None
+        begun = starts_digest(self.sim, self.starts)
+        return (
+            there
+            if made_of == (dict(self.acting.tags), self.acting.n_action_steps, begun, self.sim.max_steps)
+            else None
+        )
 
 
 def compare_sets(comparison: SetsComparison, tell: Told, bar: Bar = no_bar) -> tuple[dict[str, Any], SetsReport]:
@@ -147,10 +155,14 @@ def compare_sets(comparison: SetsComparison, tell: Told, bar: Bar = no_bar) -> t
     shown = {policy for policy, _, _ in rollouts}
     if not errors and IMAGINES_OR_FOLLOWS & shown:
         errors = {model: _held_out(comparison, *model) for model in models}
-    stay = None if shown <= FOLLOWS_RECORDINGS else _rolled_out(_staying(comparison), comparison, "stay", tell, bar)
+    stays = [
+        _rolled_out(_staying(comparison, follows), comparison, "stay", tell, bar)
+        for follows in (False, True)
+        if any((policy in FOLLOWS_RECORDINGS) == follows for policy in shown)
+    ]
     report = SetsReport(
         comparison.spec.name, comparison.sets, comparison.n_seeds, errors, rollouts,
-        dataset=str(comparison.root), preset=comparison.preset, locks=locks, stay=stay,
+        dataset=str(comparison.root), preset=comparison.preset, locks=locks, stays=stays,
     )  # fmt: skip
     return report.write(comparison.folder), report
 
@@ -158,8 +170,8 @@ def compare_sets(comparison: SetsComparison, tell: Told, bar: Bar = no_bar) -> t
 def _require_ready(comparison: SetsComparison) -> dict[str, ActionSetLock]:
     """The lock of each set. Raises where one does not hold, where what is trained before the comparison is not there, where the seeds
     are none, and where the task has no simulator."""
-    require_simulator(comparison.spec)
-    parse_seeds(comparison.seeds)
+    for policy in comparison.policies:
+        _starts(comparison, policy in FOLLOWS_RECORDINGS)
     locks = {action_set: read_action_set(comparison.root, action_set).lock for action_set in comparison.sets}
     if IMAGINES_OR_FOLLOWS & set(comparison.policies):
         _vqgan(comparison)
@@ -234,10 +246,10 @@ def _rollout(
 def _rolled_out(planned: _Planned, comparison: SetsComparison, label: str, tell: Told, bar: Bar) -> dict[str, Any]:
     if (there := planned.found()) is None:
         tell(f"rolling out {label}")
-        with bar(label, len(planned.starts) * planned.max_steps) as progress:
+        with bar(label, len(planned.starts) * planned.sim.max_steps) as progress:
             roll_out_into(
                 planned.folder, comparison.spec, planned.acting, planned.starts, name=planned.name, what=planned.what,
-                max_steps=planned.max_steps, environments=comparison.environments, with_logs=False, progress=progress,
+                max_steps=planned.sim.max_steps, environments=comparison.environments, with_logs=False, progress=progress,
             )  # fmt: skip
         there = find_rollout(planned.folder)
         assert there is not None
@@ -263,33 +275,42 @@ def _from_before(comparison: SetsComparison, policy: str, tell: Told) -> dict[tu
 
 
 def _folder(comparison: SetsComparison, policy: str, action_set: str, seed: int) -> Path:
-    few = f"-first{comparison.n_oracle}" if policy in FOLLOWS_RECORDINGS and comparison.n_oracle else ""
+    few = _few(comparison) if policy in FOLLOWS_RECORDINGS else ""
     return comparison.folder / f"{policy}{few}-{action_set}-seed{seed}"
 
 
 def _planned(comparison: SetsComparison, policy: str, action_set: str, seed: int) -> _Planned:
-    starts, recordings, what = _starts(comparison, policy)
+    starts, recordings, what = _starts(comparison, policy in FOLLOWS_RECORDINGS)
     kind = "bc" if policy == "bc" else "policy"
     request = PolicyRequest(
         comparison.root, comparison.spec, comparison.preset, _n_action_steps(comparison), device=default_device(),
         recordings=recordings, vqgan=comparison.vqgan, action_set=action_set,
         runs={kind: comparison.run(kind, action_set, seed)},
     )  # fmt: skip
-    folder, n_steps = _folder(comparison, policy, action_set, seed), require_simulator(comparison.spec).max_steps
-    return _Planned(folder, policy, load_policy(policy, request), starts, what, n_steps)
+    folder, sim = _folder(comparison, policy, action_set, seed), require_simulator(comparison.spec)
+    return _Planned(folder, policy, load_policy(policy, request), starts, what, sim)
 
 
-def _staying(comparison: SetsComparison) -> _Planned:
-    """The policy that does nothing, from the simulator's starts: what VILP and BC have to beat."""
-    starts, _, what = _starts(comparison, "stay")
+def _staying(comparison: SetsComparison, follows: bool) -> _Planned:
+    """The policy that does nothing: what is to be beaten from the simulator's starts, or from those of policies that follow
+    recordings."""
+    starts, _, what = _starts(comparison, follows)
     request = PolicyRequest(comparison.root, comparison.spec, comparison.preset, _n_action_steps(comparison))
-    n_steps = require_simulator(comparison.spec).max_steps
-    return _Planned(comparison.folder / "stay", "stay", load_policy("stay", request), starts, what, n_steps)
+    folder = comparison.folder / (f"stay-{what}{_few(comparison)}" if follows else "stay")
+    return _Planned(folder, "stay", load_policy("stay", request), starts, what, require_simulator(comparison.spec))
 
 
-def _starts(comparison: SetsComparison, policy: str) -> tuple[list[Start], dict[int, Recording], str]:
-    if policy not in FOLLOWS_RECORDINGS:
-        return seed_starts(parse_seeds(comparison.seeds)), {}, comparison.seeds
+def _few(comparison: SetsComparison) -> str:
+    """Part of the name of what follows fewer recordings than there are."""
+    return f"-first{comparison.n_oracle}" if comparison.n_oracle else ""
+
+
+def _starts(comparison: SetsComparison, follows: bool) -> tuple[list[Start], dict[int, Recording], str]:
+    """Those of policies that follow recordings, with these, or the simulator's; and which they are, in a word."""
+    require_simulator(comparison.spec)
+    if not follows:
+        starts = unseen_starts(EpisodeStore(comparison.root), comparison.spec, parse_seeds(comparison.seeds))
+        return starts, {}, comparison.seeds
     world = Worlds(comparison.spec, cameras=False)
     own = world.own_tags()
     world.close()

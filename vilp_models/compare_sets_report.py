@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 
 from vilp_data.action_set_lock import DIGITS, ActionSetLock
 from vilp_data.types import F64
-from vilp_models.intervals import Estimate, mean_estimate, rate_estimate
+from vilp_models.intervals import Estimate, crossed_estimate, mean_estimate, rate_estimate
 from vilp_models.report_files import counted, estimate_table, estimate_words, markdown_table, page, write_report_files
 
 COMPARED = ("vilp", "oracle", "bc")
@@ -20,10 +20,10 @@ COMPARED = ("vilp", "oracle", "bc")
 MEASURES = {"max_reward": "mean of max reward", "success": "success rate"}
 
 SAME = 1e-9
-"""Values of starts that are closer than this do not differ: means over seeds and differences are rounded."""
+"""An interval narrower than this says that starts and seeds did not differ: values are rounded."""
 
 NO_INTERVAL = (
-    "A value without an interval: starts did not differ (or there is one alone), so nothing says how much others would."
+    "A value without an interval: nothing differed, or there are too few starts, so nothing says how much others would."
 )
 
 
@@ -34,7 +34,7 @@ class SetsReport:
     errors    (set, seed) -> the low-level policy's report.json on held-out pairs; empty if none was trained
     rollouts  (policy, set, seed) -> a rollout's report.json; those of a policy begin at the same starts
     locks     set -> its lock: what was learnt from
-    stay      report.json of the policy that does nothing, from the simulator's starts; None where nobody began there
+    stays     report.json of the policy that does nothing, one for each choice of starts that a policy began at
     """
 
     task: str
@@ -45,35 +45,35 @@ class SetsReport:
     dataset: str = ""
     preset: str | None = None
     locks: Mapping[str, ActionSetLock] = field(default_factory=dict)
-    stay: Mapping[str, Any] | None = None
+    stays: Sequence[Mapping[str, Any]] = ()
 
     @property
     def policies(self) -> list[str]:
         return [name for name in COMPARED if any(policy == name for policy, _, _ in self.rollouts)]
 
-    def by_start(self, policy: str, action_set: str, measure: str) -> F64:
-        """float64 [starts]: the mean over training seeds. Starts, not seeds, are what the intervals are drawn over: they are the
-        larger cause of chance, and three seeds are too few to draw from."""
-        tables = [self.rollouts[policy, action_set, seed] for seed in range(self.n_seeds)]
-        return np.asarray(np.mean([_values(table, measure) for table in tables], axis=0), np.float64)
+    def values(self, policy: str, action_set: str, measure: str) -> F64:
+        """float64 [seeds,starts]"""
+        return np.array([_values(self.rollouts[policy, action_set, seed], measure) for seed in range(self.n_seeds)])
 
     def value(self, policy: str, action_set: str, measure: str) -> Estimate:
-        """Of one training seed, success is a rate of yes and no, whose interval has a width at 0 and 1 too."""
-        if self.n_seeds == 1:
-            return _of_one(self.rollouts[policy, action_set, 0], measure)
-        return _over_starts(self.by_start(policy, action_set, measure))
+        """The mean over training seeds and starts. A start counts once in the interval of a rate, by the share of seeds that
+        succeeded there: seeds that meet the same start are no trials of their own."""
+        values = self.values(policy, action_set, measure)
+        if measure == "success":
+            return rate_estimate(float(values.mean(axis=0).sum()), values.shape[1])
+        return crossed_estimate(values)
 
     def gain(self, policy: str, action_set: str, measure: str) -> Estimate:
-        """This set less the first, paired by start."""
-        first = self.by_start(policy, self.sets[0], measure)
-        return _over_starts(self.by_start(policy, action_set, measure) - first)
+        """This set less the first, from the same starts; without an interval where nothing differed, since resampling the same would
+        say that it is known for sure."""
+        first = self.values(policy, self.sets[0], measure)
+        estimate = crossed_estimate(self.values(policy, action_set, measure), first)
+        return Estimate(estimate.value, np.nan, np.nan) if estimate.high - estimate.low < SAME else estimate
 
     @property
-    def all_alike(self) -> bool:
-        """Whether a value or a difference has no interval, since starts did not differ."""
-        shown = [self.value(p, s, m) for p in self.policies for s in self.sets for m in MEASURES]
-        shown += [self.gain(p, s, m) for p in self.policies for s in self.sets[1:] for m in MEASURES]
-        return any(np.isnan(estimate.low) for estimate in shown)
+    def gains_lack_intervals(self) -> bool:
+        gains = (self.gain(p, s, m) for p in self.policies for s in self.sets[1:] for m in MEASURES)
+        return any(np.isnan(gain.low) for gain in gains)
 
     def to_json(self) -> dict[str, Any]:
         policies: dict[str, Any] = {}
@@ -94,7 +94,7 @@ class SetsReport:
             "training_seeds": self.n_seeds,
             "low_level_mae": self._errors(),
             "policies": policies,
-            "stay": None if self.stay is None else {m: estimate_table(_of_one(self.stay, m)) for m in MEASURES},
+            "stay": {stay["starts"]: {m: estimate_table(_of_one(stay, m)) for m in MEASURES} for stay in self.stays},
         }
 
     def _measured(self, policy: str, action_set: str) -> dict[str, Any]:
@@ -145,23 +145,28 @@ class SetsReport:
                     for action_set in self.sets[1:]
                 ]
                 shown.append(f"{policy}, {words}: {'; '.join([*values, *gains])}")
-        if self.stay is not None:
-            shown += [f"stay, {words}: {estimate_words(_of_one(self.stay, m), 3)}" for m, words in MEASURES.items()]
-        return [*shown, *([NO_INTERVAL] if self.all_alike else [])]
+        shown += [
+            f"staying ({stay['starts']}), {words}: {estimate_words(_of_one(stay, measure), 3)}"
+            for stay in self.stays
+            for measure, words in MEASURES.items()
+        ]
+        return [*shown, *([NO_INTERVAL] if self.gains_lack_intervals else [])]
 
     def to_markdown(self) -> str:
         """The page for people."""
         first, *others = self.sets
-        rows = []
+        rows, by_seed = [], []
         for policy in self.policies:
             for measure, words in MEASURES.items():
                 cells = [estimate_words(self.value(policy, name, measure), 3) for name in self.sets]
                 gains = [estimate_words(self.gain(policy, name, measure), 3, sign=True) for name in others]
                 rows.append([f"{policy}, {words}", *cells, *gains])
-        if self.stay is not None:  # it learns from nothing, so it is the same whatever the set
+                seeds = (self.values(policy, name, measure).mean(axis=1) for name in self.sets)
+                by_seed.append([f"{policy}, {words}", *(", ".join(f"{value:.3f}" for value in each) for each in seeds)])
+        for stay in self.stays:  # it learns from nothing, so it is the same whatever the set
             for measure, words in MEASURES.items():
-                cell = estimate_words(_of_one(self.stay, measure), 3)
-                rows.append([f"stay, {words}", *[cell] * len(self.sets), *["–"] * len(others)])
+                cell = estimate_words(_of_one(stay, measure), 3)
+                rows.append([f"staying ({stay['starts']}), {words}", *[cell] * len(self.sets), *["–"] * len(others)])
         errors = [
             [f"{part or 'action'}, {name} frames", *(", ".join(f"{value:.4g}" for value in sets[s]) for s in self.sets)]
             for part, frames in self._errors().items()
@@ -169,6 +174,7 @@ class SetsReport:
         ]
         table = self.to_json()["policies"]
         starts = [f"{name}: {counted(entry['n_starts'], 'start')} ({entry['starts']})" for name, entry in table.items()]
+        apart = len({entry["starts"] for entry in table.values()}) > 1
         hardware = sorted({entry["hardware"] for entry in table.values()})
         parts = [
             [f"# Action sets on {self.task}: {', '.join(self.sets)}"],
@@ -177,10 +183,17 @@ class SetsReport:
             [f"{counted(self.n_seeds, 'training seed')} each, one and the same planner. {'; '.join(starts)}."],
             markdown_table(" | ".join(["", *self.sets, *(f"{name} - {first}" for name in others)]), rows),
             [
-                "95 % intervals: bootstrap over starts, of the mean over training seeds; differences are paired by start.",
-                "The success rate of one training seed, and of stay, has Wilson's.",
-                *([NO_INTERVAL] if self.all_alike else []),
+                "95 % intervals of means and differences: a bootstrap over training seeds and starts; both sets of a difference see the",
+                "same starts. Few seeds tell little of others: below is what each came to. Rates have Wilson's, a start counting once.",
+                *([NO_INTERVAL] if self.gains_lack_intervals else []),
+                *(
+                    ["Policies that begin elsewhere are to be compared with staying there, not with each other."]
+                    if apart
+                    else []
+                ),
             ],
+            ["## By training seed"],
+            markdown_table(" | ".join(["", *self.sets]), by_seed),
         ]
         if errors:
             parts += [
@@ -203,14 +216,7 @@ def _values(table: Mapping[str, Any], measure: str) -> list[float]:
 def _of_one(table: Mapping[str, Any], measure: str) -> Estimate:
     """Of one rollout."""
     values = _values(table, measure)
-    return rate_estimate(int(sum(values)), len(values)) if measure == "success" else _over_starts(np.array(values))
-
-
-def _over_starts(values: F64) -> Estimate:
-    """The mean [starts] with its bootstrap interval; without one where starts did not differ, since resampling the same would say that
-    it is known for sure."""
-    estimate = mean_estimate(values)
-    return Estimate(estimate.value, np.nan, np.nan) if np.ptp(values) < SAME else estimate
+    return rate_estimate(sum(values), len(values)) if measure == "success" else mean_estimate(values)
 
 
 def _labels(lock: ActionSetLock) -> dict[str, int]:

@@ -103,16 +103,10 @@ class DataContract:
         if action and not acting:
             remedy = "give the task [action], or train on episodes that were recorded with commands"
             raise UsageError("no training episode has actions", where=root, remedy=remedy)
-        normaliser = {
-            f"latents/{view}": moments(_latent_stats(root, view, key, train))
-            for view, key in sorted((latent_keys or {}).items())
-        }
-        if low_dim and spec.low_dim:
-            normaliser["low_dim"] = moments(ChannelStats.over(_valid_steps(store, train, "low_dim", labels)))
-        if action and labels is not None:
-            normaliser["action"] = moments(labels.action)
-        elif action:
-            normaliser["action"] = moments(ChannelStats.over(_valid_steps(store, acting, "action")))
+        normaliser = _normaliser(store, train, latent_keys or {}, low_dim=low_dim and bool(spec.low_dim), labels=labels)
+        if action:
+            stats = ChannelStats.over(_valid_steps(store, acting, "action")) if labels is None else labels.action
+            normaliser["action"] = moments(stats)
         return cls(
             **_of_views(spec),
             rate_hz=spec.rate_hz or train[0].rate_hz,
@@ -204,15 +198,7 @@ class DataContract:
         """Raise UsageError where the dataset at hand (`now`) is not what this contract was made of: it names the first
         field that differs, both values, and what makes it right. `where` is the run; `model` its kind, for the command."""
         for name, (title, remedy) in _WORDS.items():
-            there, here = getattr(self, name), getattr(now, name)
-            if name in _NOT_SAID and _NOT_SAID[name] in (there, here):
-                continue
-            if name == "normaliser":
-                there, here = _other_moments(there, here)
-            elif not isinstance(there, tuple | Mapping):
-                pass
-            elif isinstance(there, Mapping):
-                there, here = _differing(there, here)
+            there, here = _differing(name, getattr(self, name), getattr(now, name))
             if there != here:
                 raise UsageError(
                     f"this model was trained with {title} than the dataset at hand",
@@ -274,6 +260,24 @@ def _of_views(spec: TaskSpec) -> dict[str, Any]:
     }
 
 
+def _normaliser(
+    store: EpisodeStore,
+    train: Sequence[EpisodeEntry],
+    latent_keys: Mapping[str, str],
+    *,
+    low_dim: bool,
+    labels: LabelledEpisodes | None,
+) -> dict[str, Moments]:
+    """Of what the model sees: latents and, where asked, low_dim."""
+    normaliser = {
+        f"latents/{view}": moments(_latent_stats(store.root, view, key, train))
+        for view, key in sorted(latent_keys.items())
+    }
+    if low_dim:
+        normaliser["low_dim"] = moments(ChannelStats.over(_valid_steps(store, train, "low_dim", labels)))
+    return normaliser
+
+
 def moments(stats: ChannelStats) -> Moments:
     """Mean and deviation as a network normalises with them."""
     still = stats.std <= MIN_RELATIVE_STD * np.maximum(1.0, np.abs(stats.mean))
@@ -287,8 +291,16 @@ def _same_moments(one: Moments, other: Moments) -> bool:
     return all(bool((np.abs(np.subtract(one[name], other[name])) <= scale).all()) for name in ("mean", "std"))
 
 
-def _differing(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[Any, Any]:
-    """The entries of two mappings that are not equal, or two equal values where all are."""
+def _differing(name: str, there: Any, here: Any) -> tuple[Any, Any]:
+    """What of a field is not the same, of mappings the entries; two equal values where nothing is, or where one side says nothing."""
+    if name in _NOT_SAID and _NOT_SAID[name] in (there, here):
+        return None, None
+    if name == "normaliser":
+        return _other_moments(there, here)
+    return _other_entries(there, here) if isinstance(there, Mapping) else (there, here)
+
+
+def _other_entries(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[Any, Any]:
     names = [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
     return tuple({name: table[name] for name in names if name in table} for table in (there, here))  # type: ignore[return-value]
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from vilp_data.types import F32, F64, I64, U8, Bool
-from vilp_models.intervals import CONFIDENCE, Estimate
+from vilp_models.intervals import Estimate, ends
 from vilp_models.metrics import MAX_PSNR_DB, squared_error
 
 Measure = Literal["latent", "moving", "changed"]
@@ -56,7 +56,7 @@ def score(sums: Sums, measure: Measure, *, minus: Sums | None = None, seed: int 
     """The score of `sums`, less that of `minus` where given (paired: both are resampled alike).
 
     Errors are pooled over all starts of the episodes before they become a PSNR; the mean is over the horizon steps where it is
-    defined. Intervals are of a bootstrap over episodes, NaN with fewer than two."""
+    defined. Intervals are of a bootstrap over episodes (`intervals.ends`)."""
     n_episodes = len(sums.total)
     weights = np.concatenate([np.ones((1, n_episodes)), resampled(n_episodes, seed=seed)])
     steps = _scores(sums, measure, weights) - (0 if minus is None else _scores(minus, measure, weights))
@@ -85,11 +85,7 @@ def _scores(sums: Sums, measure: Measure, weights: F64) -> F64:
 
 def _estimate(values: F64, n_episodes: int) -> Estimate:
     """From the value itself [0] and those of the resamples [1:]."""
-    if n_episodes < 2 or not np.isfinite(values).any():
-        return Estimate(float(values[0]), float("nan"), float("nan"))
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.nanquantile(values[1:], [tail, 1 - tail])
-    return Estimate(float(values[0]), float(low), float(high))
+    return Estimate(float(values[0]), *ends(values[1:], n_episodes))
 
 
 def latent_errors(true: F32, other: F32, std: Sequence[float]) -> F64:

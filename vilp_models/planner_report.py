@@ -32,7 +32,7 @@ from vilp_models.plan_errors import (
     score,
 )
 
-REPORT_FORMAT = 1
+REPORT_FORMAT = 2
 """Raised when the same inputs give other numbers."""
 
 CANDIDATES = ("sample", "best", "copy_reconstructed", "copy_true", "reconstruction")

@@ -21,7 +21,7 @@ from vilp_models.imagined import Decoder, decode_frames
 from vilp_models.intervals import Estimate
 from vilp_models.plan_errors import Sums, score
 
-REPORT_FORMAT = 2
+REPORT_FORMAT = 3
 """Raised when the same inputs give other numbers."""
 
 POLICY = ("true", "reconstructed")

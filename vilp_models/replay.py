@@ -11,6 +11,7 @@ import numpy as np
 from vilp_data.errors import UsageError
 from vilp_data.types import F32, F64, U8, Episode
 from vilp_models.metrics import psnr
+from vilp_models.starts import tagged_seed
 
 RENDER_MIN_DB = 40.0
 """What frames drawn from recorded states score at least against the stored ones; a swapped channel gets 29."""
@@ -85,7 +86,7 @@ def replay(episode: Episode, env: Any, *, progress: Progress | None = None) -> R
     actions, states = _replayable(episode)
     n_steps = len(states) - 1
     periods = np.array(env.metadata.get("state_periods", (np.inf,) * states.shape[1]))
-    seed = int(episode.tags["seed"]) if "seed" in episode.tags else None
+    seed = tagged_seed(episode.tags)
     errors = []
     for shift in (0, 1):
         told = None if progress is None else _behind(progress, before=shift * n_steps, total=2 * n_steps)
@@ -155,7 +156,7 @@ def render_match(episode: Episode, env: Any, *, every: int = 1, progress: Progre
     steps = range(0, episode.n_steps - 1, every)
     if not steps:
         raise UsageError("one step leaves nothing to compare", where=episode.id, remedy="choose a longer episode")
-    seed = int(episode.tags["seed"]) if "seed" in episode.tags else None
+    seed = tagged_seed(episode.tags)
     same: dict[str, list[float]] = {view: [] for view in episode.frames}
     following: dict[str, list[float]] = {view: [] for view in episode.frames}
     for done, step in enumerate(steps, start=1):

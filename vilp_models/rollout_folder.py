@@ -4,60 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from vilp_data.errors import StoreError, UsageError
+from vilp_data.errors import BusyError, UsageError
 from vilp_data.locate import is_dataset
+from vilp_data.whole_folder import put_back, whole_folder
 
+KIND = "rollout"
 VIDEOS = ("best", "median", "worst")
 
 
 @contextlib.contextmanager
 def new_rollout(folder: Path) -> Iterator[Path]:
-    """A new folder beside `folder`, which takes its place when the block ends without an exception, and else is removed: an earlier
-    rollout stays until then.
+    """A new folder that takes the place of `folder` when the block ends without an exception, and else is removed: an earlier rollout
+    stays until then. What a killed one left there is put back, or cleared away.
 
-    Raises as `require_replaceable` does, and StoreError for what the operating system refuses."""
+    Raises as `require_replaceable` and `whole_folder` do."""
     require_replaceable(folder)
-    target = folder.resolve()
-    making = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    with _refusals(folder):
-        making.mkdir(parents=True)
-    try:
+    with whole_folder(folder.resolve(), kind=KIND) as making:
         yield making
         require_replaceable(folder)  # someone may have written there meanwhile
-        with _refusals(folder):
-            _replace(target, making)
-    except BaseException:
-        shutil.rmtree(making, ignore_errors=True)
-        raise
-
-
-def _replace(target: Path, making: Path) -> None:
-    """Two renames, since a folder that is not empty cannot be renamed over; a crash between them leaves both under other names."""
-    before = making.with_suffix(".old")
-    if target.exists():
-        target.rename(before)
-    try:
-        making.rename(target)
-    except BaseException:
-        if before.exists():
-            before.rename(target)
-        raise
-    shutil.rmtree(before, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _refusals(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        remedy = "name another folder with --out, or make room"
-        raise StoreError("the rollout cannot be written", where=folder, found=error, remedy=remedy) from error
 
 
 def require_replaceable(folder: Path) -> None:
@@ -65,10 +33,10 @@ def require_replaceable(folder: Path) -> None:
     remedy = "name another folder with --out"
     if is_dataset(folder):
         raise UsageError("a rollout cannot take the place of a dataset", where=folder, remedy=remedy)
+    table = find_rollout(folder)
     if not folder.exists():
         return
     there = [path.relative_to(folder) for path in sorted(folder.rglob("*")) if not path.is_dir()]
-    table = find_rollout(folder)
     if not folder.is_dir() or (there and table is None):
         raise UsageError(
             "a rollout takes the place of another one alone, and this is something else: it has no rollout's report.json",
@@ -90,6 +58,8 @@ def require_replaceable(folder: Path) -> None:
 
 def find_rollout(folder: Path) -> dict[str, Any] | None:
     """The report.json of the finished rollout in `folder`; None where there is none, or a report of another kind."""
+    with contextlib.suppress(BusyError):  # then there is none yet
+        put_back(folder.resolve(), kind=KIND)
     try:
         table = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError, ValueError):

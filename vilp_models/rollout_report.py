@@ -27,7 +27,8 @@ from vilp_models.policies.base import Policy
 from vilp_models.report_files import counted, estimate_table, estimate_words, markdown_table, page, write_report_files
 from vilp_models.rollout import EpisodeResult, LogPlan, Progress, Timing, roll_out
 from vilp_models.rollout_folder import VIDEOS, find_rollout, new_rollout
-from vilp_models.starts import Start
+from vilp_models.simulator import require_simulator
+from vilp_models.starts import Start, starts_digest
 
 VIDEO_SIDE = 384
 """Pixels that the shorter side of a video has at least."""
@@ -45,7 +46,8 @@ class Against:
 
 @dataclass(frozen=True)
 class RolloutReport:
-    """A finished rollout. `tags` are the policy's own; `starts` says which, in a word ("100000:100050", "val")."""
+    """A finished rollout. `tags` are the policy's own; `starts` says which, in a word ("100000:100050", "val"), `starts_sha256` exactly
+    (`starts_digest`)."""
 
     policy: str
     task: str
@@ -56,6 +58,7 @@ class RolloutReport:
     tags: Mapping[str, str]
     episodes: Sequence[EpisodeResult]
     timing: Timing
+    starts_sha256: str
     against: tuple[Against, ...] = ()
 
     @property
@@ -82,6 +85,7 @@ class RolloutReport:
             "task": self.task,
             "tags": dict(self.tags),
             "starts": self.starts,
+            "starts_sha256": self.starts_sha256,
             "max_steps": self.max_steps,
             "n_action_steps": self.n_action_steps,
             "environments": self.environments,
@@ -129,8 +133,9 @@ def roll_out_into(
 
     One that is stopped leaves nothing, and what was there as it was. Raises as `rollout.roll_out` and `new_rollout` do, and
     UsageError where a rollout of `against` cannot be compared: before anything is rolled out."""
+    begun = starts_digest(require_simulator(spec), starts)
     for other in against:
-        require_comparable(other, task=spec.name, max_steps=max_steps, names=[start.name for start in starts])
+        require_comparable(other, task=spec.name, max_steps=max_steps, starts_sha256=begun)
     with new_rollout(folder) as making:
         tags = {"policy": name, **policy.tags}
         logs = LogPlan(making / "logs", tags) if with_logs else None
@@ -138,7 +143,7 @@ def roll_out_into(
             spec, policy, starts, max_steps=max_steps, environments=environments, logs=logs, progress=progress
         )
         report = RolloutReport(
-            name, spec.name, what, max_steps, policy.n_action_steps, environments, policy.tags, episodes, timing
+            name, spec.name, what, max_steps, policy.n_action_steps, environments, policy.tags, episodes, timing, begun
         )
         report = replace(report, against=tuple(compared(report, other) for other in against))
         write_rollout(report, making, spec, with_videos=with_logs)
@@ -148,7 +153,7 @@ def roll_out_into(
 def compared(report: RolloutReport, folder: Path) -> Against:
     """Our rollout against the finished one in `folder`. Raises as `require_comparable` does."""
     names = [episode.name for episode in report.episodes]
-    table = require_comparable(folder, task=report.task, max_steps=report.max_steps, names=names)
+    table = require_comparable(folder, task=report.task, max_steps=report.max_steps, starts_sha256=report.starts_sha256)
     theirs = {episode["name"]: episode for episode in table["episodes"]}
     reward = paired_difference([e.max_reward for e in report.episodes], [theirs[name]["max_reward"] for name in names])
     success = paired_difference(
@@ -157,8 +162,8 @@ def compared(report: RolloutReport, folder: Path) -> Against:
     return Against(str(table["policy"]), folder.name, reward, success)
 
 
-def require_comparable(folder: Path, *, task: str, max_steps: int, names: Sequence[str]) -> dict[str, Any]:
-    """The report of the finished rollout in `folder`, of just these starts.
+def require_comparable(folder: Path, *, task: str, max_steps: int, starts_sha256: str) -> dict[str, Any]:
+    """The report of the finished rollout in `folder`, of just these starts (`starts_digest`).
 
     Raises UsageError where it is not finished, or was made from other starts or for another number of steps."""
     table = read_rollout(folder)
@@ -168,22 +173,20 @@ def require_comparable(folder: Path, *, task: str, max_steps: int, names: Sequen
                 f"rollouts of another {name} cannot be compared", where=folder, found=f"{table[name]}, here {ours}",
                 remedy="roll both out alike",
             )  # fmt: skip
-    theirs = {episode["name"] for episode in table["episodes"]}
-    if set(names) != theirs:
-        only = sorted(set(names) ^ theirs)
+    if table.get("starts_sha256") != starts_sha256:
         raise UsageError(
             "rollouts of other starts cannot be compared pair by pair",
             where=folder,
-            found=f"{len(only)} starts in one of them alone, such as {only[0]}",
+            found=f"{table['starts']} there, of another simulator's options or of recordings as they were then, if not of other starts",
             remedy="roll both out from the same --seeds or --from-episodes",
         )
     return table
 
 
-def finished_rollout(folder: Path, *, task: str, max_steps: int, names: Sequence[str]) -> bool:
+def finished_rollout(folder: Path, *, task: str, max_steps: int, starts_sha256: str) -> bool:
     """Whether `folder` holds a finished rollout that `require_comparable` would take."""
     try:
-        require_comparable(folder, task=task, max_steps=max_steps, names=names)
+        require_comparable(folder, task=task, max_steps=max_steps, starts_sha256=starts_sha256)
     except UsageError:
         return False
     return True

@@ -9,6 +9,8 @@ An environment is what `make_env` makes, and keeps to a small contract:
 - every info holds "state", float64 [S], laid out like the episode's;
 - for a policy to act in it (`rollout`), every info also holds "is_success" and "hold_action", float32 [A]: the action that
   keeps the robot where it is;
+- how long an episode may be says `sim.max_steps` alone: a limit that was registered with gymnasium does not count, and an
+  environment that says `truncated` by itself ends the episode there;
 - `tags()`, where it has them, says what tells its world from others of the task ("goal", "object"), as its logs are tagged;
 - its metadata may say `state_names`, `state_periods` (inf where a value does not wrap around), `controlled_state` (the
   indices that the actions command; others also depend on contacts, and on what a state leaves out) and
@@ -21,7 +23,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vilp_data.errors import UsageError
-from vilp_data.sims import register
+from vilp_data.sims import make_simulator
 from vilp_data.spec import SimSpec, TaskSpec
 
 
@@ -35,30 +37,17 @@ def require_simulator(spec: TaskSpec) -> SimSpec:
 def make_env(spec: TaskSpec, *, cameras: bool = True) -> Any:
     """The task's simulator, with or without images in its observations.
 
-    Raises UsageError where the task names none, its packages are not installed, or it does not take the options."""
+    Raises UsageError where the task names none, and as `make_simulator`."""
     sim = require_simulator(spec)
-    register()
-    import gymnasium
-
-    options = sim.options if cameras else {**sim.options, "cameras": False}
-    try:
-        return gymnasium.make(sim.env, **options)
-    except TypeError as error:
-        raise UsageError(
-            f"{sim.env} cannot be made with these options",
-            where=spec.name,
-            found=f"{error} (options {', '.join(sorted(options))})",
-            remedy="its constructor must take the task's sim.options, and the keyword cameras, False where no images are wanted",
-        ) from error
-    except ImportError as error:
-        raise UsageError(f"{sim.env} is not installed", found=str(error), remedy="make setup") from error
-    except gymnasium.error.UnregisteredEnv as error:
-        remedy = "correct sim.env in its TOML"
-        raise UsageError(f"no simulator called {sim.env!r}", where=spec.name, found=error, remedy=remedy) from error
+    return make_simulator(sim.env, sim.options if cameras else {**sim.options, "cameras": False})
 
 
 WORLD_TAGS = ("goal", "object")
 """An episode that says another of these than an environment does was not recorded in its like."""
+
+
+VARIANT_TAG = "variant"
+"""Names the one of [record.variants] that an episode was recorded in; the task's own have none."""
 
 
 def world_tags(env: Any) -> dict[str, str]:
@@ -68,7 +57,11 @@ def world_tags(env: Any) -> dict[str, str]:
 
 
 def is_of_world(tags: Mapping[str, str], world: Mapping[str, str]) -> bool:
-    """Whether an episode of these tags may be of that world: no tag of it says otherwise."""
+    """Whether an episode of these tags may be of that world: no tag of it says otherwise, nor that it is of a variant."""
+    return VARIANT_TAG not in tags and _fits(tags, world)
+
+
+def _fits(tags: Mapping[str, str], world: Mapping[str, str]) -> bool:
     return all(tags.get(tag, value) == value for tag, value in world.items())
 
 
@@ -80,10 +73,13 @@ class Worlds:
         self._made: dict[str | None, Any] = {}
 
     def of(self, tags: Mapping[str, str]) -> Any:
-        """The environment that an episode of these tags was recorded in; the task's own where no variant says it is that one."""
+        """The environment that an episode of these tags was recorded in: that of the variant they name; else the first that says of
+        itself what they say; else the task's own."""
+        if (named := tags.get(VARIANT_TAG)) in self._spec.record.variants:
+            return self._env(named)
         for variant in (None, *self._spec.record.variants):
             env = self._env(variant)
-            if is_of_world(tags, world_tags(env)):
+            if _fits(tags, world_tags(env)):
                 return env
         return self._env(None)
 

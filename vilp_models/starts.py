@@ -9,12 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vilp_data.dataset_split import side_episodes
+from vilp_data.dataset_split import find_split, side_episodes
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
-from vilp_data.errors import UsageError, nearest
+from vilp_data.errors import UsageError, nearest, some_of
+from vilp_data.keys import content_digest, digest
+from vilp_data.spec import SimSpec, TaskSpec
 from vilp_data.types import F32, F64, I32, U8, is_rollout
-from vilp_models.simulator import is_of_world
+from vilp_models.simulator import Worlds, is_of_world
 
 SIDES = ("val", "train", "all")
 
@@ -26,12 +28,14 @@ class Start:
     policy_seed  what the policy draws from, and by which it finds the start's recording
     reset_seed   what the environment is reset with, if anything: it draws its own start from that
     state        float64 [S]: the recorded state to begin at instead
+    recording    content hash of the stored episode that begins there, which some policies look ahead in
     """
 
     name: str
     policy_seed: int
     reset_seed: int | None
     state: F64 | None = None
+    recording: str | None = None
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,35 @@ def seed_starts(seeds: Sequence[int]) -> list[Start]:
     return [Start(f"seed{seed:07d}", seed, seed) for seed in seeds]
 
 
+def unseen_starts(store: EpisodeStore, spec: TaskSpec, seeds: Sequence[int]) -> list[Start]:
+    """`seed_starts`, of seeds that no training episode of the task's own world was recorded from: from those a policy may know the way by
+    heart. Raises UsageError that names some of them."""
+    split = find_split(store.root)
+    sides = {} if split is None else split.assignment
+    trained = [entry for entry in store.index() if sides.get(entry.id) == "train"]
+    met = [entry for entry in trained if (seed := tagged_seed(entry.tags)) is not None and seed in seeds]
+    if met:
+        world = Worlds(spec, cameras=False)
+        own = world.own_tags()
+        world.close()
+        met = [entry for entry in met if is_of_world(entry.tags, own)]
+    if met:
+        raise UsageError(
+            "training episodes were recorded from these starts, so a policy may know them by heart",
+            where=store.root,
+            found=some_of([f"seed {entry.tags['seed']} ({entry.id})" for entry in met], 3),
+            remedy="other seeds, such as --seeds 100000:100050; or --from-episodes train, to see how it does there",
+        )
+    return seed_starts(seeds)
+
+
+def tagged_seed(tags: Mapping[str, str]) -> int | None:
+    """What the simulator was reset with for the episode of these tags; None where they do not say, or say what can be no seed. Whoever
+    begins at its recorded state needs none."""
+    text = tags.get("seed", "")
+    return int(text) if re.fullmatch("[0-9]{1,18}", text) else None
+
+
 def episode_starts(
     store: EpisodeStore, side: str, *, limit: int | None = None, world: Mapping[str, str] | None = None
 ) -> tuple[list[Start], dict[int, Recording]]:
@@ -102,9 +135,22 @@ def episode_starts(
     for entry in played:
         seed, recording = episode_seed(entry.id), open_recording(store, entry)
         recordings[seed] = recording
-        reset_seed = int(entry.tags["seed"]) if "seed" in entry.tags else None
-        starts.append(Start(entry.id, seed, reset_seed, np.array(recording.state[0], np.float64)))
+        starts.append(
+            Start(
+                entry.id, seed, tagged_seed(entry.tags), np.array(recording.state[0], np.float64), entry.content_sha256
+            )
+        )
     return starts, recordings
+
+
+def starts_digest(sim: SimSpec, starts: Sequence[Start]) -> str:
+    """SHA-256 of all that decides where rollouts from `starts` begin, and what their policies may look ahead in: two of the same
+    digest can be compared start by start."""
+    begun = [
+        [s.name, s.policy_seed, s.reset_seed, None if s.state is None else content_digest(s.state), s.recording]
+        for s in starts
+    ]
+    return digest({"env": sim.env, "options": sim.options, "starts": begun})
 
 
 def episode_seed(episode: str) -> int:

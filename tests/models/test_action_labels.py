@@ -252,7 +252,7 @@ def test_a_set_that_does_not_hold_any_more_stops_training_and_use(cards: Trained
         with pytest.raises(ActionSetError, match="episodes of it are gone"):
             uses(cards, model, run, action_set)
     set_path(cards.root, "small").unlink()
-    with pytest.raises(UsageError, match=r"no action set called 'small'(.|\n)*vilp-data actions --recipe small"):
+    with pytest.raises(UsageError, match=r"no action set called 'small'(.|\n)*vilp-data actions \S+ --recipe small"):
         uses(cards, model, run, None)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -91,7 +92,7 @@ def test_a_comparison_trains_and_rolls_out_each_model_once_and_reports_them_side
     ]  # fmt: skip
     rolled = {path.name for path in comparison.folder.iterdir() if path.is_dir()}
     learnt = {f"{p}-{s}-seed{k}" for p in ("vilp", "oracle", "bc") for s in ("small", "hybrid") for k in (0, 1)}
-    assert rolled == learnt | {"stay"}
+    assert rolled == learnt | {"stay", "stay-val"}
     assert json.loads((comparison.folder / "report.json").read_text()) == table
     assert table["policies"]["vilp"]["n_starts"] == 3
     assert table["policies"]["oracle"]["starts"] == "val"
@@ -108,8 +109,12 @@ def test_a_comparison_trains_and_rolls_out_each_model_once_and_reports_them_side
     assert table["labels"]["hybrid"] == {"episodes": 4, "steps": 4 * STEPS, "key": lock.key}
     assert f"- hybrid: 4 labelled episodes, {4 * STEPS} steps, `{lock.key[:12]}`" in words
     assert f"Dataset `{comparison.root}`, preset {PRESET}." in words
-    assert table["stay"]["success"] == {"value": 0.0, "low": 0.0, "high": 0.5615}  # Wilson's, of none of three
-    assert "| stay, success rate | 0.000 (0.000 to 0.561) | 0.000 (0.000 to 0.561) | – |" in words
+    assert set(table["stay"]) == {"0:3", "val"}
+    assert table["stay"]["0:3"]["success"] == {"value": 0.0, "low": 0.0, "high": 0.5615}  # Wilson's, of none of three
+    assert "| staying (0:3), success rate | 0.000 (0.000 to 0.561) | 0.000 (0.000 to 0.561) | – |" in words
+    assert "to be compared with staying there, not with each other" in words
+    by_seed = words.split("## By training seed")[1]
+    assert re.search(r"\| bc, mean of max reward \| \d\.\d{3}, \d\.\d{3} \| \d\.\d{3}, \d\.\d{3} \|", by_seed)
 
     told.clear()
     again, _ = compare_sets(comparison, told.append)
@@ -150,7 +155,10 @@ def test_a_comparison_from_other_starts_leaves_the_earlier_one_alone(comparison:
     ]  # fmt: skip
     assert table["policies"]["bc"]["n_starts"] == 4
     assert table["low_level_mae"] == {}
-    assert (bc.folder.name, other.folder.name) == (f"{PRESET}-small-hybrid-0-3", f"{PRESET}-small-hybrid-5-9")
+    assert (bc.folder.name, other.folder.name) == (
+        f"{PRESET}-small+hybrid-0-3-x1",
+        f"{PRESET}-small+hybrid-5-9-x1",
+    )
     assert json.loads((bc.folder / "report.json").read_text()) == first
 
 
@@ -177,7 +185,8 @@ def test_the_oracle_of_fewer_episodes_takes_nothing_from_that_of_all(comparison:
     compare_sets(every, lambda _: None)
     compare_sets(replace(every, n_oracle=1), lambda _: None)
     folders = {path.name for path in every.folder.iterdir() if path.is_dir()}
-    assert folders == {f"oracle{few}-{s}-seed0" for few in ("", "-first1") for s in every.sets}
+    of_sets = {f"oracle{few}-{s}-seed0" for few in ("", "-first1") for s in every.sets}
+    assert folders == of_sets | {"stay-val", "stay-val-first1"}
     told: list[str] = []
     compare_sets(every, told.append)
     assert not [line for line in told if line.startswith("rolling out")]
@@ -211,43 +220,65 @@ def rollout(rewards: list[float]) -> Mapping[str, Any]:
     }
 
 
-def test_differences_are_paired_by_start_after_seeds_are_averaged() -> None:
-    rollouts = {
-        ("bc", "small", 0): rollout([0.1, 0.5]), ("bc", "small", 1): rollout([0.3, 0.7]),
-        ("bc", "hybrid", 0): rollout([0.3, 0.7]), ("bc", "hybrid", 1): rollout([0.5, 1.0]),
-    }  # fmt: skip
-    report = SetsReport("x", ("small", "hybrid"), 2, {}, rollouts)
-    np.testing.assert_allclose(report.by_start("bc", "hybrid", "max_reward"), [0.4, 0.85])
-    gain = report.gain("bc", "hybrid", "max_reward")
-    assert gain.value == pytest.approx(0.225)
-    assert (gain.low, gain.high) == pytest.approx((0.2, 0.25))
-    assert report.value("bc", "hybrid", "success").value == 0.25
+REWARDS = np.array([0.1, 0.3, 0.5, 0.2, 0.8, 0.4])
 
 
-def test_success_of_one_training_seed_has_an_interval_with_a_width_at_zero() -> None:
-    rollouts = {("bc", name, 0): rollout([0.1, 0.5]) for name in ("small", "hybrid")}
-    success = SetsReport("x", ("small", "hybrid"), 1, {}, rollouts).value("bc", "small", "success")
-    assert success.value == success.low == 0
-    assert success.high == pytest.approx(0.658, abs=1e-3)
+def of_seeds(*more: float) -> dict[int, Mapping[str, Any]]:
+    return {seed: rollout((REWARDS + one).tolist()) for seed, one in enumerate(more)}
 
 
-def test_where_starts_do_not_differ_no_interval_is_claimed_and_the_report_says_so() -> None:
-    rollouts = {
-        ("bc", name, seed): rollout([0.1 + more, 0.5 + more])
-        for name, more in {"small": 0.0, "hybrid": 0.2}.items() for seed in (0, 1)
-    }  # fmt: skip
-    report = SetsReport("x", ("small", "hybrid"), 2, {}, rollouts)
+def report_on(small: Mapping[int, Any], hybrid: Mapping[int, Any]) -> SetsReport:
+    rollouts = {("bc", name, k): t for name, of in (("small", small), ("hybrid", hybrid)) for k, t in of.items()}
+    return SetsReport("x", ("small", "hybrid"), len(small), {}, rollouts)
+
+
+def test_a_difference_is_paired_by_start() -> None:
+    """Starts that differ much do not hide what every one of them gains."""
+    better = {0: rollout([reward + 0.1 + 0.01 * k for k, reward in enumerate(REWARDS)])}
+    gain = report_on(of_seeds(0.0), better).gain("bc", "hybrid", "max_reward")
+    assert gain.value == pytest.approx(0.125)
+    assert 0.1 < gain.low < 0.125 < gain.high < 0.15
+
+
+def test_training_seeds_that_come_out_differently_widen_the_interval() -> None:
+    """Three models of one set against three of another: what one lucky seed brings is not claimed for the set."""
+    lucky = report_on(of_seeds(0.0, 0.01, 0.02), of_seeds(0.0, 0.01, 0.32)).gain("bc", "hybrid", "max_reward")
+    steady = report_on(of_seeds(0.0, 0.01, 0.02), of_seeds(0.1, 0.11, 0.12)).gain("bc", "hybrid", "max_reward")
+    assert lucky.value == pytest.approx(steady.value)
+    assert lucky.low < 0 < lucky.high
+    assert steady.low > 0
+
+
+def test_a_rate_of_several_training_seeds_counts_every_start_once() -> None:
+    report = report_on(
+        {0: rollout([0.1] * 10), 1: rollout([1.0] + [0.1] * 9)}, {0: rollout([0.1] * 10), 1: rollout([0.1] * 10)}
+    )
+    once, never = (report.value("bc", name, "success") for name in ("small", "hybrid"))
+    assert (once.value, never.value) == (0.05, 0.0)
+    assert never.high == pytest.approx(0.2775, abs=1e-4)  # Wilson's of none of ten, not of twenty
+    assert once.high > never.high
+
+
+def test_where_nothing_differs_no_interval_is_claimed_and_the_report_says_so() -> None:
+    report = report_on(of_seeds(0.0, 0.0), of_seeds(0.2, 0.2))
     gain = report.gain("bc", "hybrid", "max_reward")
     assert gain.value == pytest.approx(0.2)
     assert math.isnan(gain.low)
     assert math.isnan(gain.high)
-    assert report.to_json()["policies"]["bc"]["sets"]["hybrid"]["success"] == {"value": 0.0, "low": None, "high": None}
-    assert report.lines()[0].endswith("hybrid - small +0.200")
-    assert "starts did not differ" in report.lines()[-1]
-    assert "starts did not differ" in report.to_markdown()
+    assert "hybrid - small +0.200" in report.lines()[0]
+    assert "nothing differed" in report.lines()[-1]
+    assert "nothing differed" in report.to_markdown()
 
 
-@pytest.mark.parametrize(("sets", "policies"), [(("small",), ("bc",)), (("small", "hybrid"), ("stay",))])
+@pytest.mark.parametrize(
+    ("sets", "policies"),
+    [
+        (("small",), ("bc",)),
+        (("small", "small", "hybrid"), ("bc",)),
+        (("small", "hybrid"), ("stay",)),
+        (("small", "hybrid"), ()),
+    ],
+)
 def test_nothing_to_compare_is_refused(tmp_path: Path, sets: tuple[str, ...], policies: tuple[str, ...]) -> None:
     with pytest.raises(UsageError):
         SetsComparison(tmp_path, None, None, sets, policies)  # type: ignore[arg-type]

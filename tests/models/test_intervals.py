@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vilp_models.intervals import Estimate, mean_estimate, paired_difference, rate_estimate
+from vilp_models.intervals import Estimate, crossed_estimate, mean_estimate, paired_difference, rate_estimate
 
 
 @pytest.mark.parametrize(
@@ -83,3 +83,42 @@ def test_what_has_no_interval_is_refused():
     ):
         with pytest.raises(ValueError, match="."):
             call()
+
+
+@pytest.mark.parametrize("n", [6, 8, 20])
+def test_few_values_have_an_interval_that_holds_the_mean_as_often_as_it_says(n: int) -> None:
+    samples = np.random.default_rng(n).normal(size=(400, n))
+    held = [estimate.low <= 0 <= estimate.high for estimate in (mean_estimate(row, draws=1000) for row in samples)]
+    assert 0.9 < np.mean(held) < 0.98
+
+
+def test_too_few_values_have_none() -> None:
+    assert math.isnan(mean_estimate([0.0, 1.0, 2.0, 3.0, 4.0]).low)
+    assert not math.isnan(mean_estimate([0.0, 1.0, 2.0, 3.0, 4.0, 5.0]).low)
+
+
+def test_seeds_and_starts_are_both_chance() -> None:
+    """With an effect of the training seed as large as that of a start, drawing starts alone holds the truth too seldom."""
+    random = np.random.default_rng(0)
+    both, starts = [], []
+    for _ in range(200):
+        common = random.normal(size=30)
+        ours, theirs = (common + 0.4 * random.normal(size=(3, 1)) + random.normal(size=(3, 30)) for _ in range(2))
+        crossed = crossed_estimate(ours, theirs, draws=500)
+        of_starts = mean_estimate((ours - theirs).mean(axis=0), draws=500)
+        both.append(crossed.low <= 0 <= crossed.high)
+        starts.append(of_starts.low <= 0 <= of_starts.high)
+    assert np.mean(both) > 0.88
+    assert np.mean(starts) < 0.75
+
+
+def test_what_both_sides_meet_at_a_start_drops_out() -> None:
+    common = np.random.default_rng(1).normal(0, 10, size=(1, 40))
+    ours, theirs = (
+        common + shift + np.random.default_rng(k).normal(0, 0.1, (3, 40)) for k, shift in ((2, 0.5), (3, 0))
+    )
+    gain = crossed_estimate(ours, theirs)
+    assert gain.value == pytest.approx(0.5, abs=0.05)
+    assert 0.3 < gain.low < gain.high < 0.7
+    with pytest.raises(ValueError, match="same starts"):
+        crossed_estimate(ours, theirs[:, :-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 pytest.importorskip("gymnasium", reason="the simulators are not installed: make setup")
 
 from tests.models.toy_simulator import dot_task
+from tests.stored_episodes import episode, write_dataset
 from vilp_data.episodes import EpisodeStore
 from vilp_data.errors import UsageError
 from vilp_models.cli import app
@@ -49,6 +51,14 @@ def test_starts_are_called_as_they_were_typed(root: Path) -> None:
     assert "stay on 2 starts (4:6), 3 steps each" in rolled_out(root, "--policy", "stay", "--seeds", "4:6")
     assert "stay on 1 start (4), 3 steps each" in rolled_out(root, "--policy", "stay", "--seeds", "4")
     assert {path.name for path in (root / "rollouts").iterdir()} == {"stay-4-6", "stay-4"}
+
+
+def test_starts_that_were_trained_on_are_refused(root: Path) -> None:
+    write_dataset(root, *(replace(episode(name, 6), tags={"seed": str(n)}) for n, name in enumerate("abcdef")))
+    EpisodeStore(root).write_spec(dot_task())
+    with pytest.raises(UsageError, match=r"training episodes were recorded from these starts(.|\n)*seed \d \([a-f]\)"):
+        rolled_out(root, "--policy", "stay")
+    assert "stay on 2 starts (6:8)" in rolled_out(root, "--policy", "stay", "--seeds", "6:8")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 from tests.models.test_vilp import observation, vilp
 from tests.models.trained_cards import N_ACTION_STEPS, PRESET, TrainedCards
 from tests.stored_episodes import add_episodes
+from vilp_data.cli import app as data_app
 from vilp_data.dataset_split import read_split
 from vilp_data.episode_files import open_frames, open_steps
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
@@ -153,7 +156,11 @@ def test_whole_episodes_are_made_once_and_open(
     store, ids = EpisodeStore(trained_cards.root), sorted(read_split(trained_cards.root).ids("val"))
     words = ("--data", trained_cards.root, "--preset", PRESET, "--whole", "--out", tmp_path / "out")
     first = said(*words)
-    assert f"--generated out --data {trained_cards.root}" in first
+    [command] = re.findall("look at them with `(.*)`", first)
+    program, *look = shlex.split(command)
+    assert program == "vilp-data"
+    page = CliRunner().invoke(data_app, [*look, "--html", str(tmp_path / "dream.html")], catch_exceptions=False)
+    assert page.exit_code == 0, page.output
     made = [open_generated_episode(store, tmp_path / "out", name) for name in ids]
     assert [one.maker.settings["planner"] for one in made] == [f"planner-{PRESET}"] * len(ids)
     assert {place.split("/")[1] for place in made[0].maker.files} == {

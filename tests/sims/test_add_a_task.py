@@ -125,6 +125,7 @@ def unfit(change: Callable[[str], str], folder: Path, module: str) -> None:
         ("typo_in_env", "near = bool(np.", "near = bool(npp.", r"NameError: .*npp.*typo_in_env\.py:\d+"),
         ("no_hold", '"hold_action": self.disc.astype(np.float32),', "", "info lacks 'hold_action'"),
         ("no_success", '"is_success": near,', "", "info lacks 'is_success'"),
+        ("no_view", 'seen["top"] = image', "pass", "observation lacks 'top'"),
         ("no_low_dim", 'seen = {"low_dim": self.disc.astype(np.float32)}', "seen = {}", "observation lacks 'low_dim'"),
     ],
 )

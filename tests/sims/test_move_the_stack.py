@@ -23,7 +23,7 @@ from vilp_data.sims.move_the_stack_expert import MoveTheStackExpert  # noqa: E40
 from vilp_data.sims.move_the_stack_scene import BOARD_SIZE, NEST_STEP, TABLE_HEIGHT  # noqa: E402
 from vilp_data.sims.record import record_task  # noqa: E402
 from vilp_data.sources import open_log  # noqa: E402
-from vilp_data.spec import load_task  # noqa: E402
+from vilp_data.task_toml import load_task  # noqa: E402
 from vilp_models.replay import render_match, replay  # noqa: E402
 
 BOARD_TOP = TABLE_HEIGHT + BOARD_SIZE[2]

@@ -24,7 +24,7 @@ from vilp_data.sims.nut_assembly import NutAssemblyEnv, NutScene  # noqa: E402
 from vilp_data.sims.nut_assembly_expert import NutAssemblyExpert  # noqa: E402
 from vilp_data.sims.record import RecordedEpisode, record_task  # noqa: E402
 from vilp_data.sources import open_log  # noqa: E402
-from vilp_data.spec import load_task  # noqa: E402
+from vilp_data.task_toml import load_task  # noqa: E402
 from vilp_models.simulator import Worlds  # noqa: E402
 
 WORLDS = {"task": ("square", "square"), "other_goals": ("square", "round"), "other_objects": ("round", "round")}

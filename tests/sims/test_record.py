@@ -110,8 +110,10 @@ def test_a_log_made_with_other_options_is_not_overwritten(recorded: RecordedEpis
 
 
 def test_a_failure_is_written_and_tagged(tmp_path: Path) -> None:
-    [failure] = record_task(one_disc(max_steps=4), tmp_path, episodes=1, first_seed=0, workers=1)
-    assert not failure.success
+    spec = one_disc()
+    short = spec.model_copy(update={"sim": spec.sim.model_copy(update={"max_steps": 4})})
+    [failure] = record_task(short, tmp_path, episodes=1, first_seed=0, workers=1)
+    assert (failure.success, failure.n_steps) == (False, 4)
     with open_log(failure.path) as log:
         assert log.metadata()["episode"]["success"] == "false"
 

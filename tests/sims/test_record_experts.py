@@ -12,11 +12,13 @@ from typer.testing import CliRunner
 from vilp_data.assemble import assemble_episode
 from vilp_data.cli import app
 from vilp_data.errors import SpecError, UsageError
+from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sims import record
 from vilp_data.sims.record import RecordedEpisode, record_task
 from vilp_data.sources import open_log
 from vilp_data.spec import SimSpec, TaskSpec
 from vilp_data.task_toml import load_task
+from vilp_data.twins import twin_hash
 from vilp_data.types import Episode
 from vilp_models.metrics import psnr
 from vilp_models.replay import render_match, replay
@@ -102,12 +104,113 @@ def test_a_variant_that_the_task_does_not_have_is_named(tmp_path):
         record_task(load_task("hanoi"), tmp_path, episodes=1, first_seed=0, variant="off_target")
 
 
+def test_variants_of_one_seed_are_twins_though_no_picture_is_the_same(recorded):
+    """Why `record` keeps their seeds apart, and a split their episodes on one side."""
+    gray, purple = (
+        assembled(recorded["arrange_blocks", variant].path, load_task("arrange_blocks"))
+        for variant in (None, "off_target")
+    )
+    assert not np.array_equal(gray.frames["top"], purple.frames["top"])
+    one, other = (twin_hash({"action": e.action, "low_dim": e.low_dim}) for e in (gray, purple))
+    assert one == other != twin_hash({"action": gray.action + 1, "low_dim": gray.low_dim})
+
+
+def test_seeds_of_another_part_of_the_task_are_not_recorded(tmp_path):
+    spec = load_task("arrange_blocks")
+    for first_seed, variant in ((1679, "off_target"), (5067, None), (4999, None)):
+        with pytest.raises(
+            SpecError, match=rf"recorded from the same seeds(.|\n)*{first_seed} to {first_seed + 1} and"
+        ):
+            record_task(spec, tmp_path, episodes=2, first_seed=first_seed, variant=variant)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_expert_may_take_as_long_as_a_policy_and_no_longer(tmp_path):
     spec = load_task("arrange_blocks")
     short = spec.model_copy(update={"sim": spec.sim.model_copy(update={"max_steps": 5})})
     [failure] = record_task(short, tmp_path, episodes=1, first_seed=3, workers=1)
     assert (failure.n_steps, failure.success) == (5, False)
     assert assembled(failure.path, spec).tags["success"] == "false"
+
+
+def damaged_in_its_middle(data: bytes) -> bytes:
+    third = len(data) // 3
+    return data[:third] + bytes(byte ^ 0xFF for byte in data[third : third + 50]) + data[third + 50 :]
+
+
+def test_a_log_that_is_damaged_in_its_middle_is_made_again(recorded, tmp_path):
+    whole = recorded["arrange_blocks", None].path.read_bytes()
+    path = tmp_path / recorded["arrange_blocks", None].path.name
+    path.write_bytes(damaged_in_its_middle(whole))
+    recorded_one("arrange_blocks", None, tmp_path)
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("changed", "found"),
+    [
+        ({"seed": 4}, "other seed: 3, now 4"),
+        ({"max_steps": 301}, "other max_steps: 300, now 301"),
+        ({"version": "9.9"}, r"other pymunk_version: .*, now 9.9"),
+        ({"code": "other"}, "other source_sha256: .*, now other"),
+        ({"task": "rows"}, "other task: arrange_blocks, now rows"),
+    ],
+)
+def test_a_finished_log_of_something_else_is_neither_kept_nor_overwritten(
+    recorded, tmp_path, monkeypatch, changed, found
+):
+    spec, seed = load_task("arrange_blocks"), changed.get("seed", 3)
+    name = changed.get("task", spec.name)
+    path = tmp_path / f"{name}-seed{seed:07d}.mcap"
+    path.write_bytes(recorded["arrange_blocks", None].path.read_bytes())
+    spec = spec.model_copy(
+        update={"name": name, "sim": spec.sim.model_copy(update={"max_steps": changed.get("max_steps", 300)})}
+    )
+    real = record.version
+    if "version" in changed:
+        monkeypatch.setattr(record, "version", lambda name: "9.9" if name == "pymunk" else real(name))
+    if "code" in changed:
+        monkeypatch.setattr(record, "source_digest", lambda modules: "other")
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=rf"made from something else(.|\n)*{found}"):
+        record_task(spec, tmp_path, episodes=1, first_seed=seed, workers=1)
+    assert path.read_bytes() == before
+
+
+def test_a_log_from_before_logs_told_their_code_is_kept_and_one_line_says_so(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(EpisodeRecorder, "__init__", without_made_from(EpisodeRecorder.__init__))
+    first = recorded_one("arrange_blocks", None, tmp_path)
+    monkeypatch.undo()
+    before = first.path.read_bytes()
+    assert before != recorded["arrange_blocks", None].path.read_bytes()
+    assert not recorded_one("arrange_blocks", None, tmp_path).says_what_made_it
+    asked = ["record", "--task", "arrange_blocks", "--episodes", "1", "--first-seed", "3", "--out", str(tmp_path)]
+    assert "1 kept, made before logs told" in CliRunner().invoke(app, asked).stdout
+    assert first.path.read_bytes() == before
+
+
+def without_made_from(init):
+    return lambda self, path, *, made_from=None, **rest: init(self, path, **rest)
+
+
+def test_what_a_log_was_made_from_is_no_tag(recorded):
+    tags = assembled(recorded["pusht", None].path, load_task("pusht")).tags
+    assert not {"source_sha256", "max_steps", "expert"} & tags.keys()
+
+
+def test_a_mistake_in_an_installed_package_is_placed_too():
+    try:
+        exec(compile("1 / 0", "/x/site-packages/vilp_data/sims/can.py", "exec"), {})
+    except ZeroDivisionError as error:
+        error.__traceback__ = error.__traceback__.tb_next  # as where all of VILP is installed
+        assert record._place(error) == "/x/site-packages/vilp_data/sims/can.py:1"
+
+
+def test_no_episodes_and_seeds_below_zero_are_refused(tmp_path):
+    for words in (("--episodes", "0"), ("--episodes", "-1"), ("--first-seed", "-3")):
+        asked = ["record", "--task", "arrange_blocks", "--out", str(tmp_path / "logs"), *words]
+        ended = CliRunner().invoke(app, asked)
+        assert (ended.exit_code, (tmp_path / "logs").exists()) == (2, False), ended.output
 
 
 def test_options_that_the_simulator_does_not_take_are_an_error_and_no_traceback(tmp_path):

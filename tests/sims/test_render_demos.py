@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from vilp_data.decode import decode_image
 from vilp_data.errors import LogError, UsageError
 from vilp_data.recorder import EpisodeRecorder
 from vilp_data.sims import render_demos
-from vilp_data.sims.render_demos import RenderOptions, render_demonstrations
+from vilp_data.sims.render_demos import DemoWorld, RenderOptions, render_demonstrations
 from vilp_data.sources import open_log
 
 DEMONSTRATIONS = "robosuite_demos/v1.0.1/robosuite/models/assets/demonstrations"
@@ -210,14 +211,35 @@ def test_what_cannot_be_drawn_leaves_no_log(
     assert not list((tmp_path / "logs").glob("*"))
 
 
+def built(**arguments: Any) -> DemoWorld:
+    pytest.importorskip("robosuite", reason="the simulators are not installed: make setup")
+    return DemoWorld("Lift", {"robots": "Panda", **arguments}, None, RenderOptions(height=32, width=32), where="demo")
+
+
+@pytest.mark.sim
+def test_a_world_has_the_grippers_and_the_table_of_its_recording() -> None:
+    world = built(
+        gripper_types="RethinkGripper", table_full_size=[0.4, 0.4, 0.05], control_freq=20, controller_configs={"type": "OSC_POSE"},
+        reward_shaping=True, has_renderer=True, camera_names=["agentview"], env_version="1.4.1", type=1,
+    )  # fmt: skip
+    with contextlib.closing(world):
+        assert type(world._env.robots[0].gripper["right"]).__name__ == "RethinkGripper"
+        assert world._model.geom("table_collision").size.tolist() == [0.2, 0.2, 0.025]
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("arguments", [{"mount_types": "default"}, {"gripper_types": "Hook"}, {"table_full_size": [1]}])
+def test_a_world_that_robosuite_cannot_build_is_refused_in_words(arguments: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=rf"cannot be built(.|\n)*{next(iter(arguments))}"):
+        built(**arguments)
+
+
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["door", "lift"])
 def test_real_demonstrations_end_in_success_with_the_hand_at_the_object(task: str, tmp_path: Path) -> None:
     """Only where the world stands as it stood then: the door was placed by chance, and no state holds its place."""
     pytest.importorskip("robosuite", reason="the simulators are not installed: make setup")
-    from vilp_data.sims.render_demos import DemoWorld
-
     source = real_data(f"{DEMONSTRATIONS}/{task}/panda/demo.hdf5")
     with open_log(source) as log:
         states = [message.body for message in log.messages(["states"])]

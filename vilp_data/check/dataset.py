@@ -17,6 +17,7 @@ from vilp_data.check.motion import Series, idle_ends, idle_findings, moved_betwe
 from vilp_data.check.report import Checked, Sheet, Steps, TopicFacts
 from vilp_data.check.stored_files import damaged, held_findings, latent_findings
 from vilp_data.check.tracks import PICTURES, picture_of
+from vilp_data.dataset_action_sets import check_sets
 from vilp_data.dataset_split import check_dataset_split, find_split
 from vilp_data.duplicates import near_duplicates
 from vilp_data.episode_files import open_frames, open_steps
@@ -77,6 +78,7 @@ class _Look:
         self.findings += [*latent_findings(self.store.root, self.entries), *held_findings(self.store.root)]
         self._never_moving()
         self._look_alike(self._split())
+        self._action_sets()
         rate_hz = self.entries[0].rate_hz if self.entries else 0.0
         steps = Steps("action", rate_hz, True, tuple(self.trajectories)) if self.trajectories else None
         return Checked(
@@ -243,6 +245,21 @@ class _Look:
             none_yet = sentence.startswith("no split yet")
             self._say("note" if none_yet else "warning", "split", sentence, f"`vilp-data split {self.source}`")
         return lock
+
+    def _action_sets(self) -> None:
+        for wrong in (error for _, errors in check_sets(self.store.root).values() for error in errors):
+            evidence = {"file": str(wrong.where)} | ({"found": str(wrong.found)} if wrong.found is not None else {})
+            place = Place(source=self.source)
+            self.findings.append(
+                Finding(
+                    severity="warning",
+                    kind="action-set",
+                    place=place,
+                    what=wrong.what,
+                    evidence=evidence,
+                    remedy=wrong.remedy,
+                )
+            )
 
     def _facts(self) -> Iterator[TopicFacts]:
         for view, table in self.spec.views.items():

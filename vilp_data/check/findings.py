@@ -15,8 +15,8 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Worst first. An error: data that cannot be read, or that would train something wrong. A warning: data that ingest will mask, or that
 deserves a look. A note: nothing wrong, worth knowing."""
 
-TOLD_APART = ("unreadable", "damaged", "copies")
-"""Kinds that say only that something cannot be read, or is there several times: what, or why, is in the sentence."""
+TOLD_APART = ("unreadable", "damaged", "copies", "action-set")
+"""Kinds that say only that something cannot be read, is there several times, or does not hold: what, or why, is in the sentence."""
 
 Evidence = Mapping[str, float | int | str]
 

@@ -9,7 +9,7 @@ import typer
 
 from vilp_data.action_set_lock import DIGITS, ActionSetLock
 from vilp_data.cli.options import DatasetArgument, JsonOption, PresetOption, open_dataset, print_json
-from vilp_data.errors import ActionSetError, number_of
+from vilp_data.errors import number_of
 from vilp_data.task_toml import load_task
 
 
@@ -59,14 +59,9 @@ def actions(
 
 
 def _list_sets(root: Path, *, as_json: bool) -> None:
-    from vilp_data.dataset_action_sets import check_set, find_action_set, set_names
+    from vilp_data.dataset_action_sets import check_sets
 
-    found: dict[str, tuple[ActionSetLock | None, list[ActionSetError]]] = {}
-    for name in set_names(root):
-        try:
-            found[name] = find_action_set(root, name), check_set(root, name)
-        except ActionSetError as error:
-            found[name] = None, [error]
+    found = check_sets(root)
     if as_json:
         print_json(
             {

@@ -37,6 +37,7 @@ def split(
     Example: vilp-data split --ratio 0.9
     """
     from vilp_data.dataset_split import check_dataset_split, find_split, lock_path, update_split
+    from vilp_data.split import leaks
 
     root, spec = open_dataset(dataset)
     if check:
@@ -63,6 +64,13 @@ def split(
         print("  episodes placed before stay where they are; --redraw draws anew")
     for group in lock.duplicates:
         print(f"  identical, kept on one side: {', '.join(group)}")
+    if twins := lock.twin_groups:
+        alike = number_of(len(twins), "group")
+        print(
+            f"  the same actions under other pictures, one episode to the split: {alike}, such as {some_of(twins[0], 5)}"
+        )
+    for leak in leaks(lock, ()):
+        print(f"  {leak}; `vilp-data split --redraw` draws anew")
     crossing = [pair for pair in lock.near_duplicates if lock.assignment[pair.first] != lock.assignment[pair.second]]
     if crossing:
         closest = f"{crossing[0].first} and {crossing[0].second}"

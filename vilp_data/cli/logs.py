@@ -44,9 +44,11 @@ def record(
     out: Annotated[
         Path | None, typer.Option(help="Folder for the logs. Default: data/TASK/logs.", show_default=False)
     ] = None,
-    episodes: Annotated[int | None, typer.Option(help="How many. Default: the task's.", show_default=False)] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="How many. Default: the task's.", show_default=False)
+    ] = None,
     first_seed: Annotated[
-        int | None, typer.Option(help="Seeds count up from here. Default: the task's.", show_default=False)
+        int | None, typer.Option(min=0, help="Seeds count up from here. Default: the task's.", show_default=False)
     ] = None,
     variant: Annotated[
         str | None,
@@ -90,6 +92,10 @@ def record(
             f"{folder}: {number_of(len(recorded), 'log')}, {succeeded} successful"
             + ("" if succeeded == len(recorded) else "; failures are tagged, and ingest leaves them out")
         )
+        if earlier := sum(not episode.says_what_made_it for episode in recorded):
+            print(
+                f"  {earlier} kept, made before logs told the code that made them: whether it was today's, nobody knows"
+            )
 
 
 def inspect(

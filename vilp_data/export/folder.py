@@ -1,19 +1,19 @@
-"""A folder that appears whole, or not at all: written beside its name, synced, renamed."""
+"""The folder of an export: another takes its place only once it is whole, and with --force."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from vilp_data import shards
-from vilp_data.errors import BusyError, StoreError, UsageError
+from vilp_data.errors import StoreError, UsageError
+from vilp_data.whole_folder import put_back, whole_folder
 
 MANIFEST = "export.json"
 """The file that makes a folder an export: the only kind of folder that --force replaces."""
+
+KIND = "export"
 
 HEADROOM = 1.05
 
@@ -26,22 +26,13 @@ def out_folder(out: Path, *, force: bool, needed_bytes: int) -> Iterator[Path]:
     where `out` is in the way, StoreError where the disk has no room for `needed_bytes` or cannot be written, BusyError where another
     process is writing the same export."""
     out = out.absolute()
+    put_back(out, kind=KIND)
     require_free(out, force=force)
-    temporary, aside = out.with_name(f".{out.name}.export.tmp"), out.with_name(f".{out.name}.export.old")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         require_space(out.parent, int(HEADROOM * needed_bytes))
-        with _owned(temporary):
-            try:
-                if _put_back(aside, out):
-                    require_free(out, force=force)
-                yield temporary
-                _sync(temporary)
-                _take_place(temporary, out, aside)
-            except BaseException:
-                shutil.rmtree(temporary, ignore_errors=True)
-                raise
-        shards.sync_folder(out.parent)
+        with whole_folder(out, kind=KIND) as folder:
+            yield folder
     except OSError as error:
         remedy = "free some space, or check the folder's permissions; nothing was replaced"
         raise StoreError(
@@ -81,59 +72,3 @@ def require_space(folder: Path, needed_bytes: int) -> None:
             found=f"{free / 1e9:.2f} GB free, about {needed_bytes / 1e9:.2f} GB needed",
             remedy="free some space, or name another disk with -o",
         )
-
-
-@contextlib.contextmanager
-def _owned(temporary: Path) -> Iterator[None]:
-    """The temporary folder, empty, and locked for this process; what a killed one left in it is cleared away."""
-    temporary.mkdir(exist_ok=True)
-    descriptor = os.open(temporary, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            remedy = "wait until it is done, or stop it"
-            raise BusyError("another process is writing this export", where=temporary, remedy=remedy) from error
-        for leftover in temporary.iterdir():
-            shutil.rmtree(leftover) if leftover.is_dir() and not leftover.is_symlink() else leftover.unlink()
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _sync(folder: Path) -> None:
-    """Every file and folder below, on disk."""
-    for path in [folder, *folder.rglob("*")]:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def _put_back(aside: Path, out: Path) -> bool:
-    """Finish what a killed export left: the earlier export has its name again where the kill came before the new one took it, else is gone.
-    Whether it came back."""
-    if not aside.is_dir():
-        return False
-    if out.exists() and any(out.iterdir()):
-        shutil.rmtree(aside, ignore_errors=True)
-        return False
-    aside.replace(out)
-    shards.sync_folder(out.parent)
-    return True
-
-
-def _take_place(temporary: Path, out: Path, aside: Path) -> None:
-    """Rename; an export that was there steps aside first, and comes back where the rename fails."""
-    if not out.is_dir():
-        temporary.rename(out)
-        return
-    out.rename(aside)
-    try:
-        temporary.rename(out)
-    except BaseException:
-        aside.rename(out)
-        raise
-    shards.sync_folder(out.parent)  # the old one goes when the new one has its name for good
-    shutil.rmtree(aside, ignore_errors=True)

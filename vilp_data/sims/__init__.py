@@ -10,6 +10,7 @@ import importlib.util
 import logging
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 from vilp_data.errors import UsageError
@@ -38,6 +39,24 @@ def register() -> None:
     for name, entry_point in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(id=name, entry_point=entry_point)
+
+
+def make_simulator(env: str, options: Mapping[str, Any]) -> Any:
+    """The environment of that gymnasium id itself, without wrappers: no limit of steps, no checks. UsageError where there is none of that
+    id, or it does not take `options`."""
+    register()
+    import gymnasium
+
+    try:
+        return gymnasium.make(env, disable_env_checker=True, **options).unwrapped
+    except TypeError as error:
+        remedy = "its constructor must take [sim]'s options, those of [record.variants], and cameras=False for a world without images"
+        found = f"{error} (options {', '.join(sorted(options))})"
+        raise UsageError("the simulator does not take these options", where=env, found=found, remedy=remedy) from error
+    except (gymnasium.error.Error, ImportError) as error:
+        own = "`env` of [sim] is a gymnasium id; of a package of yours MODULE:ID, which must be on PYTHONPATH"
+        remedy = "make setup" if env in ENVIRONMENTS else own
+        raise UsageError("the simulator cannot be made", where=env, found=error, remedy=remedy) from error
 
 
 def load_entry_point(name: str) -> Any:

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 BASE_FRAME = "base"
 RATE_HZ = 10
 GRIPPER_OPEN, GRIPPER_CLOSED = -1.0, 1.0
+HAND_DOWN = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(
+    2
+)  # (x, y, z, w): a hand that points down, its fingers across the reach
 _MUJOCO_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_WARMSTART
 
 Scene = TypeVar("Scene", bound=ArmScene)
@@ -38,7 +41,8 @@ class Proprioception:
     time_s             since the reset
     joint_position     float64 [J] rad, joint_velocity float64 [J] rad/s, in the order of `ArmEnv.joint_names`
     ee_position        float64 [3] m, in the robot's base frame
-    ee_quaternion      float64 [4] (x, y, z, w), base frame, sign chosen to be continuous
+    ee_quaternion      float64 [4] (x, y, z, w), base frame; of its two signs, after a reset the one nearer `HAND_DOWN`, from there
+                       on the one nearer the sample before
     gripper_position   float64 [2] m, the finger joints: (0.04, -0.04) open, (0, 0) closed
     """
 
@@ -57,11 +61,14 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
                  low_dim: float32 [9], end-effector position, quaternion (x, y, z, w), finger joints
     action       float32 [7]: position delta in m (±0.05), axis-angle delta in rad (±0.5), both in the base frame and from the
                  pose reached so far; gripper -1 open, +1 close
-    info         state: float64 [S], all that `reset(options={"state": ...})` needs to go on from here bit for bit;
+    info         state: float64 [S], all that `reset(options={"state": ...})` needs to go on from here bit for bit, whatever the
+                 seed; but where the hand has turned more than half a turn from `HAND_DOWN`, the quaternion goes on with the
+                 other sign;
                  is_success: bool; proprioception: the samples since the last step, 20 Hz, the newest at this observation;
-                 hold_action: float32 [7], no motion and the gripper as it was last told (open, before it was told anything)
+                 hold_action: float32 [7], no motion and the gripper as it was last told (open, before it was told anything; from a
+                 restored state, to the side that the fingers' targets are on, which may still be on their way to the other)
     terminated   on success
-    truncated    after `max_steps` steps
+    truncated    never: how long an episode may be, says who plays it (`sim.max_steps`)
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -71,24 +78,23 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
         "replay_tolerance": 1e-6,
     }
 
-    def __init__(self, scene: Scene, *, height: int, width: int, cameras: bool, max_steps: int) -> None:
+    def __init__(self, scene: Scene, *, height: int, width: int, cameras: bool) -> None:
         """`height` and `width` are those of every view, of a `scene` that was built to draw them if `cameras`."""
         self.scene = scene
         self.cameras = cameras
         self.height, self.width = height, width
-        self.max_steps = max_steps
         self.render_mode = "rgb_array" if cameras else None
         self.action_space = _action_space()
         self.observation_space = _observation_space(self.views, height, width)
-        self._n_steps = 0
         self._gripper_command = GRIPPER_OPEN
-        self._home_quaternion: F64 | None = None
+        self._ee_quaternion = HAND_DOWN
 
     # --- what a task says
 
     @abstractmethod
     def draw_episode(self, rng: np.random.Generator) -> None:
-        """Draw what sets this episode apart, for the reset of the scene that follows; the joints' first angles are drawn by themselves."""
+        """Draw what sets this episode apart, for the reset of the scene that follows. What robosuite's own environments draw (where their
+        things lie, the joints' first angles) is drawn by themselves; in a scene of ours the joints begin at the robot's own angles."""
 
     @abstractmethod
     def is_solved(self) -> bool:
@@ -108,10 +114,8 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
         self.draw_episode(self.np_random)
         self.scene.seed_noise(int(self.np_random.integers(1 << 62)))
         self.scene.reset()
-        self._n_steps = 0
         self._gripper_command = GRIPPER_OPEN
-        self.scene.refresh_kinematics()
-        self._home_quaternion = _ee_quaternion(self.scene)
+        self._ee_quaternion = HAND_DOWN
         if state is not None:
             self._restore(np.asarray(state, np.float64))
         self.scene.forget_controller_cache()
@@ -125,11 +129,10 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
             self.scene.step(command)
             self.scene.refresh_kinematics()
             samples.append(self._proprioception())
-        self._n_steps += 1
         self._gripper_command = float(command[-1])
         info = self._info(samples)
         success = bool(info["is_success"])
-        return self._observation(), float(success), success, self._n_steps >= self.max_steps, info
+        return self._observation(), float(success), success, False, info
 
     def render(self) -> Any:
         """All views side by side, uint8 [height, n width, 3]; None without cameras."""
@@ -222,20 +225,20 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
 
     def _proprioception(self) -> Proprioception:
         robot, data = self.scene.robots[0], self.scene.sim.data
-        quaternion = _ee_quaternion(self.scene)
-        if self._home_quaternion is not None and quaternion @ self._home_quaternion < 0:
-            quaternion = -quaternion
+        # Of a hand that points down w is about 0, and the sign that a matrix gives by itself a matter of rounding.
+        quaternion = _quaternion(self.scene)
+        self._ee_quaternion = quaternion if quaternion @ self._ee_quaternion >= 0 else -quaternion
         return Proprioception(
             time_s=float(data.time),
             joint_position=data.qpos[robot._ref_joint_pos_indexes].copy(),
             joint_velocity=data.qvel[robot._ref_joint_vel_indexes].copy(),
             ee_position=self.scene.grip_position() - robot.base_pos,
-            ee_quaternion=quaternion,
+            ee_quaternion=self._ee_quaternion,
             gripper_position=data.qpos[robot._ref_gripper_joint_pos_indexes["right"]].copy(),
         )
 
 
-def _ee_quaternion(scene: ArmScene) -> F64:
+def _quaternion(scene: ArmScene) -> F64:
     """(x, y, z, w) of the grip site; the base stands upright at the world's orientation, so world and base axes agree."""
     return np.asarray(transforms.mat2quat(scene.grip_rotation()), np.float64)
 

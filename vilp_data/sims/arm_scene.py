@@ -95,7 +95,8 @@ class ArmScene(ManipulationEnv):  # type: ignore[misc]  # robosuite has no types
         return bool(self.check_contact(self.robots[0].gripper["right"].contact_geoms, geoms))
 
     def seed_noise(self, seed: int) -> None:
-        """What the next reset draws (the joints' first angles, and where robosuite's own tasks put things) follows from `seed`."""
+        """What the next reset of one of robosuite's own environments draws (where things lie, the joints' first angles) follows from
+        `seed`."""
         self.rng.bit_generator.state = np.random.default_rng(
             seed
         ).bit_generator.state  # in place: its samplers share it

@@ -13,7 +13,6 @@ from vilp_data.sims.arm_scene import ArmScene, Camera
 from vilp_data.types import F64
 
 COMPARTMENT = 3  # of four: robosuite counts them as it counts milk, bread, cereal, can
-MAX_STEPS = 400  # of an episode; the expert needs about 80
 
 
 class CanScene(ArmScene, PickPlaceCan):  # type: ignore[misc]  # robosuite has no types
@@ -81,10 +80,9 @@ class CanEnv(ArmEnv[CanScene]):
         height: int = 96,
         width: int = 96,
         cameras: bool = True,
-        max_steps: int = MAX_STEPS,
     ) -> None:
         scene = CanScene(robot, image_size=(height, width) if cameras else None)
-        super().__init__(scene, height=height, width=width, cameras=cameras, max_steps=max_steps)
+        super().__init__(scene, height=height, width=width, cameras=cameras)
 
     def draw_episode(self, rng: np.random.Generator) -> None:
         """Nothing: the scene draws all there is to draw."""

@@ -11,14 +11,14 @@ from vilp_data.sims.hanoi_scene import DISC_HEIGHT, DISC_RADII, HanoiScene
 
 ON_PEG_RADIUS = 0.010  # a disc on a peg can be 6 mm off centre
 ON_PEG_HEIGHT_ERROR = 0.004
-STEPS_PER_MOVE = 100  # limit of an episode; the expert needs about 45
 
 
 class HanoiEnv(ArmEnv[HanoiScene]):
     """Move `n_discs` discs, one at a time, from peg 0 to peg `goal_peg`, never a larger one on a smaller one. Views: front, side.
 
-    It is solved once all discs lie on the goal peg in order and the gripper has let go. The seed of `reset` draws the base angle,
-    uniform in (pi/4, 3pi/4).
+    It is solved once all discs lie on the goal peg in order and the gripper has let go: the end alone is judged, not whether a disc was
+    ever carried with another or lay on a smaller one. The seed of `reset` draws the base angle, uniform in (pi/4, 3pi/4); the arm
+    begins in one pose.
     """
 
     def __init__(
@@ -30,7 +30,6 @@ class HanoiEnv(ArmEnv[HanoiScene]):
         height: int = 96,
         width: int = 160,
         cameras: bool = True,
-        max_steps: int | None = None,
     ) -> None:
         if not 1 <= n_discs <= len(DISC_RADII):
             raise UsageError("Towers of Hanoi has 1 to 3 discs", where="n_discs", found=n_discs)
@@ -38,8 +37,7 @@ class HanoiEnv(ArmEnv[HanoiScene]):
             raise UsageError("the goal is peg 1 or 2; all discs begin on peg 0", where="goal_peg", found=goal_peg)
         self.n_discs, self.goal_peg = n_discs, goal_peg
         scene = HanoiScene(robot, n_discs, image_size=(height, width) if cameras else None)
-        steps = max_steps if max_steps is not None else STEPS_PER_MOVE * (2**n_discs - 1)
-        super().__init__(scene, height=height, width=width, cameras=cameras, max_steps=steps)
+        super().__init__(scene, height=height, width=width, cameras=cameras)
 
     def draw_episode(self, rng: np.random.Generator) -> None:
         self.scene.base_angle = float(rng.uniform(np.pi / 4, 3 * np.pi / 4))

@@ -40,13 +40,12 @@ class MoveTheStackEnv(ArmEnv[StackScene]):
         height: int = 96,
         width: int = 128,
         cameras: bool = True,
-        max_steps: int = 250,
     ) -> None:
         if not 2 <= n_cups <= len(CUP_COLOURS):
             raise UsageError("a stack has 2 or 3 cups", where="n_cups", found=n_cups)
         self.n_cups = n_cups
         scene = StackScene(robot, n_cups, image_size=(height, width) if cameras else None)
-        super().__init__(scene, height=height, width=width, cameras=cameras, max_steps=max_steps)
+        super().__init__(scene, height=height, width=width, cameras=cameras)
 
     def draw_episode(self, rng: np.random.Generator) -> None:
         while True:

@@ -81,14 +81,13 @@ class NutAssemblyEnv(ArmEnv[NutScene]):
         height: int = 80,
         width: int = 80,
         cameras: bool = True,
-        max_steps: int = 200,
     ) -> None:
         for name, shape in (("nut", nut), ("peg", peg)):
             if shape not in SHAPES:
                 raise UsageError(f"a {name} is square or round", where=name, found=shape)
         self.nut, self.peg = nut, peg
         scene = NutScene(robot, nut=nut, peg=peg, image_size=(height, width) if cameras else None)
-        super().__init__(scene, height=height, width=width, cameras=cameras, max_steps=max_steps)
+        super().__init__(scene, height=height, width=width, cameras=cameras)
 
     def draw_episode(self, rng: np.random.Generator) -> None:
         """Nothing here: where the nut lies, robosuite draws."""

@@ -2,7 +2,7 @@
 
     t_k = t_0 + k / rate     cameras and joints measure, the simulator's state is taken, then action k is issued; all stamped t_k
 
-Hanoi's joints, end effector and gripper measure again at t_k + 50 ms. The last tick holds the final observation and the command to
+An arm's joints, end effector and gripper measure again at t_k + 50 ms. The last tick holds the final observation and the command to
 stand still, so every tick has both.
 """
 
@@ -17,7 +17,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,9 +25,10 @@ from typing import Any, Protocol
 from vilp_data.engine import cpu_count, map_unordered
 from vilp_data.errors import LogError, UsageError, VilpDataError, nearest
 from vilp_data.recorder import EpisodeRecorder
-from vilp_data.sims import load_entry_point, register
+from vilp_data.sims import ENVIRONMENTS, load_entry_point, make_simulator
 from vilp_data.sims.episode_log import START_NS, tick_writer
-from vilp_data.sims.finished_log import finished_tags
+from vilp_data.sims.finished_log import finished_log
+from vilp_data.sims.source_digest import source_digest
 from vilp_data.spec import SimSpec, TaskSpec
 from vilp_data.types import F32
 
@@ -86,12 +87,14 @@ RECORDABLE = {
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """A finished log. `n_steps` counts the actions that were executed."""
+    """A finished log. `n_steps` counts the actions that were executed. `says_what_made_it`: not so an earlier one that was kept, of which
+    nobody knows whether the same code would record it again."""
 
     path: Path
     seed: int
     success: bool
     n_steps: int
+    says_what_made_it: bool = True
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,7 @@ class _Job:
     variant: str | None
     path: Path
     seed: int
+    made_from: Mapping[str, str]
 
 
 def record_task(
@@ -115,24 +119,26 @@ def record_task(
 ) -> list[RecordedEpisode]:
     """Record one episode for each of `episodes` seeds from `first_seed` on, into `out_dir/<task>-seed0000007.mcap`.
 
-    A finished log of the same seed and options is kept; anything unfinished is made again. Failures of the expert are written too,
+    A finished log that the same task, seed, options, limit of steps, code and versions made is kept; anything unfinished or damaged is
+    made again. Failures of the expert are written too,
     with success "false" in their metadata: it may take as many steps as a policy (`spec.sim.max_steps`). `spec.sim.options` go to the
     environment, those of `variant` (one of `spec.record.variants`) on top; its logs are `<task>-<variant>-seed…` and say so. `workers` 0
     means one process for each core. `progress` hears (done, total) after each; the list returned is in order of seed.
 
     Raises UsageError where the task has no scripted expert, the simulator is not installed, it or the expert fails (with the seed and
-    the place), or a log in `out_dir` was made with other options; SpecError for a variant that it does not have.
+    the place), or a log in `out_dir` was made from something else; SpecError for a variant that it does not have, and for seeds that run
+    into those of another part of `spec.record`.
     """
     if spec.sim is None or (spec.sim.expert is None and spec.sim.env not in RECORDABLE):
         env = "no [sim] table" if spec.sim is None else spec.sim.env
         remedy = f"{nearest(env, RECORDABLE)}, or name one of yours as `expert` of [sim] (docs/add_a_task.md)"
         raise UsageError("there is no scripted expert for this task", where=spec.name, found=env, remedy=remedy)
+    seeds = range(first_seed, first_seed + episodes)
     name = spec.name if variant is None else f"{spec.name}-{variant}"
     sim = spec.sim if variant is None else spec.simulated_as(variant)
-    jobs = [
-        _Job(spec, sim, variant, out_dir / f"{name}-seed{seed:07d}.mcap", seed)
-        for seed in range(first_seed, first_seed + episodes)
-    ]
+    spec.record.require_apart(variant, seeds, where=spec.name)
+    code = _made_from(sim)
+    jobs = [_Job(spec, sim, variant, out_dir / f"{name}-seed{seed:07d}.mcap", seed, code) for seed in seeds]
     done = {job.seed: kept for job in jobs if (kept := _finished(job)) is not None}
     todo = [job for job in jobs if job.seed not in done]
     if progress is not None:
@@ -181,36 +187,45 @@ def _require_packages(names: Sequence[str]) -> None:
 
 
 def _finished(job: _Job) -> RecordedEpisode | None:
-    """The episode in a log that is already there; UsageError where it was made with other options. One that is damaged is made again:
+    """The episode in a log that is already there; UsageError where it was made from something else. One that is damaged is made again:
     its seed gives the same."""
     try:
-        tags = finished_tags(job.path, {"options": _options_text(job)})
+        finished = finished_log(job.path, _stated(job), job.made_from)
     except LogError:
         return None
-    return (
-        None if tags is None else RecordedEpisode(job.path, job.seed, tags["success"] == "true", int(tags["n_steps"]))
+    if finished is None:
+        return None
+    tags = finished.tags
+    return RecordedEpisode(
+        job.path, job.seed, tags["success"] == "true", int(tags["n_steps"]), finished.says_what_made_it
     )
 
 
-def _options_text(job: _Job) -> str:
-    return json.dumps(dict(job.sim.options), sort_keys=True)
+def _stated(job: _Job) -> dict[str, str]:
+    """Tags that say what a log is made from."""
+    return {
+        "task": job.spec.name,
+        "seed": str(job.seed),
+        "options": _options_text(job.sim),
+        **{f"{name}_version": version(name) for name in ("vilp", *_recordable(job.sim).stated) if _is_installed(name)},
+    }
 
 
-def _make_env(sim: SimSpec) -> Any:
-    """The environment itself, without gymnasium's wrappers. UsageError where there is none of that id, or it does not take the options."""
-    register()
-    import gymnasium
+def _is_installed(package: str) -> bool:
+    with contextlib.suppress(PackageNotFoundError):
+        return bool(version(package))
+    return False
 
-    try:
-        return gymnasium.make(sim.env, disable_env_checker=True, **sim.options).unwrapped
-    except TypeError as error:
-        remedy = "compare the options of [sim] and of its [record.variants] with the environment's"
-        raise UsageError(
-            "the simulator does not take these options", where=sim.env, found=error, remedy=remedy
-        ) from error
-    except (gymnasium.error.Error, ImportError) as error:
-        remedy = "`env` of [sim] is a gymnasium id; of a package of yours MODULE:ID, which must be on PYTHONPATH"
-        raise UsageError("the simulator cannot be made", where=sim.env, found=error, remedy=remedy) from error
+
+def _made_from(sim: SimSpec) -> dict[str, str]:
+    """What else makes a log what it is: who drives what, for how long, and the code of both."""
+    expert = _recordable(sim).expert
+    modules = [name.partition(":")[0] for name in (ENVIRONMENTS.get(sim.env, sim.env), expert) if ":" in name]
+    return {"env": sim.env, "expert": expert, "max_steps": str(sim.max_steps), "source_sha256": source_digest(modules)}
+
+
+def _options_text(sim: SimSpec) -> str:
+    return json.dumps(dict(sim.options), sort_keys=True)
 
 
 def _make_expert(sim: SimSpec, env: Any, seed: int) -> Expert:
@@ -237,13 +252,13 @@ def _record_one(job: _Job) -> RecordedEpisode:
 
 
 def _played(job: _Job) -> RecordedEpisode:
-    env = _make_env(job.sim)
+    env = make_simulator(job.sim.env, job.sim.options)
     try:
         observation, info = env.reset(seed=job.seed)
         _refuse_incomplete(job, observation, info)
         expert = _make_expert(job.sim, env, job.seed)
         write = tick_writer(job.spec, env)
-        with EpisodeRecorder(job.path, metadata=_tags(job, env, expert), seed=job.seed) as log:
+        with EpisodeRecorder(job.path, metadata=_tags(job, env, expert), made_from=job.made_from, seed=job.seed) as log:
             tick, tick_ns = 0, round(1e9 / (job.spec.rate_hz or env.metadata["render_fps"]))
             for action in islice(expert.actions(), job.sim.max_steps):
                 write(log, START_NS + tick * tick_ns, observation, info, action)
@@ -263,15 +278,16 @@ def _where(job: _Job) -> str:
 
 
 def _place(error: Exception) -> str:
-    """File and line of the innermost frame that is not an installed package's."""
+    """File and line of the innermost frame that is not an installed package's, if there is one (VILP may itself be installed)."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "site-packages" not in Path(frame.filename).parts]
-    return f"{own[-1].filename}:{own[-1].lineno}"
+    innermost = (own or frames)[-1]
+    return f"{innermost.filename}:{innermost.lineno}"
 
 
 def _refuse_incomplete(job: _Job, observation: Mapping[str, Any], info: Mapping[str, Any]) -> None:
     for what, given, needed in (
-        ("observation", observation, ("low_dim",)),
+        ("observation", observation, ("low_dim", *job.spec.views)),
         ("info", info, ("state", "is_success", "hold_action")),
     ):
         for name in needed:
@@ -286,12 +302,9 @@ def _refuse_incomplete(job: _Job, observation: Mapping[str, Any], info: Mapping[
 
 def _tags(job: _Job, env: Any, expert: Expert) -> dict[str, str]:
     return {
-        "task": job.spec.name,
-        "seed": str(job.seed),
         **(env.tags() if hasattr(env, "tags") else {}),
         **expert.tags(),
         **({} if job.variant is None else {"variant": job.variant}),
         "policy": "scripted_expert",
-        "options": _options_text(job),
-        **{f"{name}_version": version(name) for name in ("vilp", *_recordable(job.sim).stated)},
+        **_stated(job),
     }

@@ -3,7 +3,8 @@
     t_k = t_0 + k / rate     the simulator is put into state k; cameras, joints, end effector and gripper are read, and action k is
                              written; all stamped t_k
 
-The environment is built anew by the robosuite that is installed, and what stands still in it (tables, pegs, a door) is moved to where
+The environment is built anew by the robosuite that is installed, with the recording's arguments of the world (arms, grippers, table,
+bins, objects), and what stands still in it (tables, pegs, a door) is moved to where
 the demonstration's own model has it. Where that robosuite knows no such environment, or its states have another length, the
 demonstration is refused: a state put into another world would draw pictures of things that never happened.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,7 +29,7 @@ from vilp_data.engine import map_unordered
 from vilp_data.errors import LogError, UsageError, nearest
 from vilp_data.recorder import NO_LATENCY, EpisodeRecorder
 from vilp_data.sims.episode_log import START_NS
-from vilp_data.sims.finished_log import finished_tags
+from vilp_data.sims.finished_log import finished_log
 from vilp_data.sims.record import require_simulator
 from vilp_data.sources import open_log
 from vilp_data.sources.hdf5_log import Hdf5Log
@@ -37,6 +39,11 @@ STATES, ACTIONS = "states", "actions"
 CONTROL_RATE_HZ = 20.0  # robosuite's own, where a file does not state its rate
 DRAWN_BY_CHANCE = {"Wipe": "its dirt lies elsewhere each time the environment is built, and no state says where"}
 WORLD_FRAME = "world"
+NOT_OF_THE_WORLD = re.compile(
+    r"(has|render|renderer|camera|reward|use_(camera|object)|controller)_?\w*|control_freq|lite_physics|horizon|ignore_done|hard_reset|seed"
+    r"|initialization_noise|placement_initializer|env_(name|version)|type"
+)
+"""Arguments of a recording that say how it was driven, looked at and begun, and nothing of what its states are states of."""
 
 
 @dataclass(frozen=True)
@@ -267,16 +274,17 @@ def _build(name: str, arguments: dict[str, Any], options: RenderOptions, where: 
         found = f"{name!r}; robosuite {version('robosuite')} has {', '.join(sorted(known))}"
         remedy = "leave it out: versions before 1.0 named robots in their environments, and their meshes are no longer shipped"
         raise UsageError("the installed simulator knows no such environment", where=where, found=found, remedy=remedy)
-    robots = arguments.get("robots", "Panda")
+    world = {key: value for key, value in arguments.items() if not NOT_OF_THE_WORLD.fullmatch(key)}
+    robots = world.pop("robots", "Panda")
     try:
         env = robosuite.make(
             name, robots=robots, has_renderer=False, has_offscreen_renderer=True, use_camera_obs=False, ignore_done=True,
-            hard_reset=False, camera_heights=options.height, camera_widths=options.width,
-            **({"env_configuration": arguments["env_configuration"]} if "env_configuration" in arguments else {}),
+            hard_reset=False, camera_heights=options.height, camera_widths=options.width, **world,
         )  # fmt: skip
         env.reset()
-    except (ValueError, KeyError, TypeError, AssertionError) as error:
-        found = f"{name} with {robots}: {str(error) or repr(error)}"
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, AssertionError) as error:
+        built_of = "".join(f", {key} {value!r}" for key, value in world.items())
+        found = f"{name} with {robots}{built_of}: {str(error) or repr(error)}"
         remedy = "render it with the robosuite that recorded it"
         raise UsageError("the environment cannot be built", where=where, found=found, remedy=remedy) from error
     return env
@@ -377,12 +385,13 @@ def _tags(job: _Job, environment: str) -> dict[str, str]:
 def _finished(job: _Job) -> RenderedDemo | None:
     """The log that is there already; UsageError where it was drawn from something else, or is no log that can be read."""
     try:
-        tags = finished_tags(job.path, _made_from(job))
+        finished = finished_log(job.path, _made_from(job))
     except LogError as error:
         remedy = "move it away, or render into another folder: logs of this command appear whole or not at all"
         raise UsageError(
             "a damaged or foreign file is in the way", where=job.path, found=error.what, remedy=remedy
         ) from error
-    if tags is None:
+    if finished is None:
         return None
+    tags = finished.tags
     return RenderedDemo(job.path, job.demonstration, tags.get("success") == "true", int(tags.get("n_steps", 0)))

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vilp_data.action_set_lock import ActionSetLock, check_action_set
+from vilp_data.action_set_lock import ActionSetLock
 from vilp_data.check.findings import SEVERITIES, Finding
 from vilp_data.check.sources import check_sources
-from vilp_data.dataset_action_sets import find_action_set, set_names, set_path
+from vilp_data.dataset_action_sets import find_action_set, set_names, wrong_with
 from vilp_data.dataset_split import find_split
 from vilp_data.episodes import EpisodeEntry, EpisodeStore
 from vilp_data.errors import SplitError, VilpDataError
@@ -172,7 +172,7 @@ def _sets(root: Path, split: SplitLock | None, entries: Sequence[EpisodeEntry]) 
         if split is None:
             yield NamedSet(name, lock, "the split it was chosen in cannot be read")
             continue
-        wrong = next(iter(check_action_set(lock, split, entries, where=set_path(root, name))), None)
+        wrong = next(wrong_with(root, name, lock, split, entries), None)
         yield NamedSet(name, lock, wrong.what, wrong.remedy) if wrong else NamedSet(name, lock)
 
 

@@ -32,6 +32,8 @@ PANEL_HEIGHT = 192
 KIND_HEADS = ["recon\u00adstructed", "imagined"]
 """KINDS over narrow columns: the first may be hyphenated."""
 
+UNKNOWN = "–"
+
 POSTER_QUALITY = 95
 
 BLOCK_BYTES = 3 << 20
@@ -160,13 +162,11 @@ def _lead(shown: _Episode) -> str:
 def _tally(shown: _Episode) -> str:
     made = shown.generated
     cells = [
-        (f"{_mean(list(made.psnr_db[kind].values())):.1f}", f"dB PSNR, {kind}")
-        for kind in ("imagined", "reconstructed")
+        (_mean(list(made.psnr_db[kind].values()), 1), f"dB PSNR, {kind}") for kind in ("imagined", "reconstructed")
     ]
     if made.lpips:
         cells += [
-            (f"{_mean(list(made.lpips[kind].values())):.3f}", f"LPIPS, {kind}")
-            for kind in ("imagined", "reconstructed")
+            (_mean(list(made.lpips[kind].values()), 3), f"LPIPS, {kind}") for kind in ("imagined", "reconstructed")
         ]
     return '<ul class="tally">' + "".join(f"<li><b>{value}</b>{what}</li>" for value, what in cells) + "</ul>"
 
@@ -267,13 +267,13 @@ def _tables(shown: _Episode) -> Iterator[str]:
 
 
 def _cells(rows: Bool, columns: list[tuple[F32, int]]) -> list[str]:
-    return [str(int(rows.sum())), *(f"{_mean([values[rows]]):.{digits}f}" for values, digits in columns)]
+    return [str(int(rows.sum())), *(_mean([values[rows]], digits) for values, digits in columns)]
 
 
 def _action_row(name: str, made: F32, recorded: F32) -> list[str]:
     known, digits = np.isfinite(made) & np.isfinite(recorded), _digits(made)
-    error = np.abs(made[known] - recorded[known])
-    return [name, f"{error.mean():.{digits}f}", f"{recorded[known].std():.{digits}f}", str(int(known.sum()))]
+    deviation = f"{recorded[known].std():.{digits}f}" if known.any() else UNKNOWN
+    return [name, _mean([np.abs(made - recorded)], digits), deviation, str(int(known.sum()))]
 
 
 def _table(caption: str, head: list[str], rows: list[list[str]], *, over: Sequence[tuple[str, int]] = ()) -> str:
@@ -287,10 +287,11 @@ def _table(caption: str, head: list[str], rows: list[list[str]], *, over: Sequen
     return f'<div class="wide"><table><caption>{escape(caption)}</caption><thead>{top}</thead><tbody>{body}</tbody></table></div>'
 
 
-def _mean(values: list[F32]) -> float:
+def _mean(values: list[F32], digits: int) -> str:
+    """Of what is known, in words."""
     together = np.concatenate(values)
     known = together[np.isfinite(together)]
-    return float(known.mean()) if len(known) else float("nan")
+    return f"{known.mean():.{digits}f}" if len(known) else UNKNOWN
 
 
 def _digits(values: F32) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,6 +11,7 @@ import typer
 
 from vilp_data.cli.options import PresetOption, progress_bar
 from vilp_data.errors import UsageError
+from vilp_data.generated_episode import generated_name
 from vilp_data.spec import TaskSpec
 from vilp_models.cli.options import (
     DataOption,
@@ -24,6 +26,28 @@ from vilp_models.cli.options import (
 )
 from vilp_models.runs import find_model_run
 
+EpisodesOption = Annotated[int, typer.Option(min=1, help="How many videos, spread over the validation episodes.")]
+LongOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Feed the last imagined frame back until there are this many; needs planners without low_dim."
+    ),
+]
+WholeOption = Annotated[
+    bool,
+    typer.Option(
+        "--whole", help="Walk along whole episodes as VILP would act on them, for `vilp-data view --generated`."
+    ),
+]
+EpisodeOption = Annotated[
+    list[str] | None,
+    typer.Option(help="With --whole: this validation episode; may be given again.", show_default=False),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option(help="Folder. Default: DATA/generated/RUN, with an action set RUN-SET.", show_default=False),
+]
+
 
 def generate(
     task: TaskOption = None,
@@ -31,31 +55,15 @@ def generate(
     data: DataOption = None,
     run: ModelRunOption = None,
     vqgan: VqganOption = None,
-    episodes: Annotated[int, typer.Option(min=1, help="How many videos, spread over the validation episodes.")] = 6,
-    long: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Feed the last imagined frame back until there are this many; needs planners without low_dim."
-        ),
-    ] = None,
-    whole: Annotated[
-        bool,
-        typer.Option(
-            "--whole", help="Walk along whole episodes as VILP would act on them, for `vilp-data view --generated`."
-        ),
-    ] = False,
-    episode: Annotated[
-        list[str] | None,
-        typer.Option(help="With --whole: this validation episode; may be given again.", show_default=False),
-    ] = None,
+    episodes: EpisodesOption = 6,
+    long: LongOption = None,
+    whole: WholeOption = False,
+    episode: EpisodeOption = None,
     action_set: SetOption = None,
     denoising_steps: DenoisingStepsOption = None,
     sampler: SamplerOption = None,
     seed: NoiseSeedOption = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder. Default: DATA/generated/RUN, with an action set RUN-SET.", show_default=False),
-    ] = None,
+    out: OutOption = None,
 ) -> None:
     """Imagine from validation starts: real, reconstructed, imagined and error as video (.mp4), picture (.png) and recording (.rrd).
 
@@ -133,4 +141,5 @@ def _whole(
     with progress_bar("imagining", n_episodes) as advance:
         for line in generate_whole(request, out, n_episodes=n_episodes, ids=ids, progress=advance):
             print(line)
-    print(f"in {out}; look at them with `vilp-data view --generated {out.name} --data {root}`")
+    look = ["vilp-data", "view", "--generated", generated_name(root, out), "--data", str(root)]
+    print(f"in {out}; look at them with `{shlex.join(look)}`")

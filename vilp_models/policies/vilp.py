@@ -157,7 +157,7 @@ class VilpPolicy:
             }
 
     def _noise(self, shape: Sequence[int]) -> Tensor:
-        """Unit noise [B,*shape]. Views with latents of one shape get the same, which helps them to choose the same future."""
+        """Unit noise [B,*shape]. Views with latents of one shape get the same."""
         drawn = [
             np.random.default_rng([seed, self._n_plans]).standard_normal(shape, np.float32) for seed in self._seeds
         ]
