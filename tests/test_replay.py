@@ -148,7 +148,9 @@ def test_a_users_simulator_is_made_with_its_options_and_told_of_cameras_only_to_
     ("options", "cameras", "says"), [("", False, "cameras"), ("options = { gian = 2.0 }", True, "gian")]
 )
 def test_a_simulator_that_does_not_take_its_options_is_told_the_contract(task, options, cameras, says):
-    with pytest.raises(UsageError, match=rf"test/Own-v0: the simulator does not take these options(.|\n)*{says}(.|\n)*must take"):
+    with pytest.raises(
+        UsageError, match=rf"test/Own-v0: the simulator does not take these options(.|\n)*{says}(.|\n)*must take"
+    ):
         make_env(task(Plain, options), cameras=cameras)
 
 
