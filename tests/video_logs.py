@@ -49,10 +49,13 @@ def write_log(path: Path, rows: Sequence[Row], **options: Any) -> Path:
     return path
 
 
-def joints(count: int, *, rate_hz: int = RATE_HZ) -> list[Row]:
-    """Joint `t` says how many seconds after the start it was."""
+def joints(count: int, *, rate_hz: int = RATE_HZ, first_s: float = 0.0) -> list[Row]:
+    """Joint `t` says how many seconds after the start it was, and `first_s` more."""
     times = [START_NS + i * 10**9 // rate_hz for i in range(count)]
-    return [Row(t, JOINTS, JointStates(joints=[{"name": "t", "position": (t - START_NS) / 1e9}])) for t in times]
+    said = [first_s + (t - START_NS) / 1e9 for t in times]
+    return [
+        Row(t, JOINTS, JointStates(joints=[{"name": "t", "position": at}])) for t, at in zip(times, said, strict=True)
+    ]
 
 
 def write_video(path: Path, sent: Sequence[Encoded], name: str, **options: Any) -> Path:

@@ -19,8 +19,10 @@ from vilp_data.split_lock import SplitLock
 
 
 def twin_hash(steps: Mapping[str, npt.NDArray[Any]]) -> str | None:
-    """Equal for twins; None for an episode without actions, which has no labels to give away."""
-    return content_digest(steps["action"], steps["low_dim"]) if "action" in steps else None
+    """Equal for twins. None for an episode that has no labels to give away: one without actions, or in which nothing ever moves."""
+    if "action" not in steps or all((column == column[:1]).all() for column in (steps["action"], steps["low_dim"])):
+        return None
+    return content_digest(steps["action"], steps["low_dim"])
 
 
 def twin_hashes(store: EpisodeStore, entries: Iterable[EpisodeEntry], known: SplitLock | None) -> dict[str, str]:

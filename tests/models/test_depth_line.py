@@ -56,7 +56,7 @@ def write_camera_log(path: Path, number: int) -> Path:
         rgb = RawImage(encoding="rgb8", step=3 * WIDTH, data=colour.tobytes(), **size)
         mm = RawImage(encoding="16UC1", step=2 * WIDTH, data=distance.astype("<u2").tobytes(), **size)
         rows += [Row(START_NS + i * PERIOD_NS, CAMERA, rgb), Row(START_NS + i * PERIOD_NS, DEPTH, mm)]
-    return write_log(path, [*rows, *joints(STEPS)])
+    return write_log(path, [*rows, *joints(STEPS, first_s=number)])
 
 
 def depth_spec(**depth: object) -> TaskSpec:
