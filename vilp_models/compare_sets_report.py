@@ -61,19 +61,18 @@ class SetsReport:
         values = self.values(policy, action_set, measure)
         if measure == "success":
             return rate_estimate(float(values.mean(axis=0).sum()), values.shape[1])
-        return crossed_estimate(values)
+        return _with_width(crossed_estimate(values))
 
     def gain(self, policy: str, action_set: str, measure: str) -> Estimate:
-        """This set less the first, from the same starts; without an interval where nothing differed, since resampling the same would
-        say that it is known for sure."""
+        """This set less the first, from the same starts."""
         first = self.values(policy, self.sets[0], measure)
-        estimate = crossed_estimate(self.values(policy, action_set, measure), first)
-        return Estimate(estimate.value, np.nan, np.nan) if estimate.high - estimate.low < SAME else estimate
+        return _with_width(crossed_estimate(self.values(policy, action_set, measure), first))
 
     @property
-    def gains_lack_intervals(self) -> bool:
-        gains = (self.gain(p, s, m) for p in self.policies for s in self.sets[1:] for m in MEASURES)
-        return any(np.isnan(gain.low) for gain in gains)
+    def some_lack_intervals(self) -> bool:
+        shown = [self.value(p, s, m) for p in self.policies for s in self.sets for m in MEASURES]
+        shown += [self.gain(p, s, m) for p in self.policies for s in self.sets[1:] for m in MEASURES]
+        return any(np.isnan(estimate.low) for estimate in shown)
 
     def to_json(self) -> dict[str, Any]:
         policies: dict[str, Any] = {}
@@ -150,7 +149,7 @@ class SetsReport:
             for stay in self.stays
             for measure, words in MEASURES.items()
         ]
-        return [*shown, *([NO_INTERVAL] if self.gains_lack_intervals else [])]
+        return [*shown, *([NO_INTERVAL] if self.some_lack_intervals else [])]
 
     def to_markdown(self) -> str:
         """The page for people."""
@@ -185,7 +184,7 @@ class SetsReport:
             [
                 "95 % intervals of means and differences: a bootstrap over training seeds and starts; both sets of a difference see the",
                 "same starts. Few seeds tell little of others: below is what each came to. Rates have Wilson's, a start counting once.",
-                *([NO_INTERVAL] if self.gains_lack_intervals else []),
+                *([NO_INTERVAL] if self.some_lack_intervals else []),
                 *(
                     ["Policies that begin elsewhere are to be compared with staying there, not with each other."]
                     if apart
@@ -213,10 +212,15 @@ def _values(table: Mapping[str, Any], measure: str) -> list[float]:
     return [float(episode[measure]) for episode in table["episodes"]]
 
 
+def _with_width(estimate: Estimate) -> Estimate:
+    """Without its interval where nothing differed: resampling the same would say that it is known for sure."""
+    return Estimate(estimate.value, np.nan, np.nan) if estimate.high - estimate.low < SAME else estimate
+
+
 def _of_one(table: Mapping[str, Any], measure: str) -> Estimate:
     """Of one rollout."""
     values = _values(table, measure)
-    return rate_estimate(sum(values), len(values)) if measure == "success" else mean_estimate(values)
+    return rate_estimate(sum(values), len(values)) if measure == "success" else _with_width(mean_estimate(values))
 
 
 def _labels(lock: ActionSetLock) -> dict[str, int]:

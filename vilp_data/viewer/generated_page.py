@@ -153,9 +153,10 @@ def _lead(shown: _Episode) -> str:
     generated = shown.generated
     told = (
         f"{len(generated.plan_step)} plans over {shown.entry.n_steps} steps ({shown.duration_s:.1f} s), "
-        f"{len(generated.step)} imagined frames{' of each view' if len(generated.views) > 1 else ''}; "
-        f"the recording: {shown.entry.outcome}"
+        f"{len(generated.step)} imagined frames{' of each view' if len(generated.views) > 1 else ''}"
     )
+    if shown.entry.outcome != "unknown":
+        told += f"; the recording is a {shown.entry.outcome}"
     return f'<p class="mono">{escape(generated.episode)}</p><p class="soft">{escape(told)}</p>'
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from typing import Annotated
 
@@ -49,7 +50,8 @@ def compare(
     comparison = SetsComparison(
         root, spec, preset, _names(sets), _names(policies), training_seeds, seeds, episodes, envs, vqgan, restart
     )
-    table, report = compare_sets(comparison, lambda line: print(line, file=sys.stderr), progress_bar)
+    with contextlib.redirect_stdout(sys.stderr):  # trainings tell what they do; stdout is the report's alone
+        table, report = compare_sets(comparison, print, progress_bar)
     print_json(table) if as_json else print(
         "\n".join([*report.lines(), f"{comparison.folder}/report.md shows it in full"])
     )
