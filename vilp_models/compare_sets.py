@@ -115,18 +115,13 @@ class _Planned:
         there = find_rollout(self.folder)
         if there is None:
             return None
-        made_of = (
-            there["tags"],
-            there.get("n_action_steps"),
-            there.get("starts_sha256"),
-            there["max_steps"],
-        )
-        begun = starts_digest(self.sim, self.starts)
-        return (
-            there
-            if made_of == (dict(self.acting.tags), self.acting.n_action_steps, begun, self.sim.max_steps)
-            else None
-        )
+        wanted = {
+            "tags": dict(self.acting.tags),
+            "n_action_steps": self.acting.n_action_steps,
+            "starts_sha256": starts_digest(self.sim, self.starts),
+            "max_steps": self.sim.max_steps,
+        }
+        return there if all(there.get(name) == value for name, value in wanted.items()) else None
 
 
 def compare_sets(comparison: SetsComparison, tell: Told, bar: Bar = no_bar) -> tuple[dict[str, Any], SetsReport]:
@@ -170,8 +165,8 @@ def compare_sets(comparison: SetsComparison, tell: Told, bar: Bar = no_bar) -> t
 def _require_ready(comparison: SetsComparison) -> dict[str, ActionSetLock]:
     """The lock of each set. Raises where one does not hold, where what is trained before the comparison is not there, where the seeds
     are none, and where the task has no simulator."""
-    for policy in comparison.policies:
-        _starts(comparison, policy in FOLLOWS_RECORDINGS)
+    for follows in {policy in FOLLOWS_RECORDINGS for policy in comparison.policies}:
+        _starts(comparison, follows)
     locks = {action_set: read_action_set(comparison.root, action_set).lock for action_set in comparison.sets}
     if IMAGINES_OR_FOLLOWS & set(comparison.policies):
         _vqgan(comparison)
