@@ -68,7 +68,9 @@ def test_make_latents_walks_from_nothing_to_windows_of_latents_and_then_has_noth
     assert "all there already" in second
     assert tree(tmp_path) == before
 
-    assert "off by at most 0 (within 1e-06)" in make("replay", "TASK=hanoi", "PRESET=tiny", f"DATA={tmp_path}")
+    replayed = make("replay", "TASK=hanoi", "PRESET=tiny", f"DATA={tmp_path}")
+    assert "off by at most 0 (within 1e-06)" in replayed
+    assert "3 of 3 episodes replay as recorded; 3 of 3 end as recorded (3 in success)" in replayed
 
 
 @pytest.mark.sim
@@ -99,15 +101,17 @@ def test_make_rollout_trains_every_model_and_lets_them_act(tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.sim
-@pytest.mark.parametrize("task", ["arrange_blocks", "pusht"])
-def test_tasks_with_variants_go_from_nothing_to_a_policy_that_acts(tmp_path: Path, task: str) -> None:
-    pytest.importorskip("gym_pusht", reason="the simulators are not installed: make setup")
+@pytest.mark.parametrize(
+    ("task", "n_logs"), [("arrange_blocks", 6), ("pusht", 6), ("can", 3), ("nut_assembly", 7), ("move_the_stack", 3)]
+)
+def test_every_task_goes_from_nothing_to_a_policy_that_acts(tmp_path: Path, task: str, n_logs: int) -> None:
+    pytest.importorskip("robosuite", reason="the simulators are not installed: make setup")
     words = [f"TASK={task}", "PRESET=tiny", "SEEDS=0:1", f"DATA={tmp_path}"]
-    told = make("rollout", *words)
-    assert "6 logs, 6 successful" in told
-    assert "6 episodes ingested" in told
+    told = make("latents", "planner", "policy", "rollout", *words)
+    assert f"{n_logs} logs, {n_logs} successful" in told
+    assert f"{n_logs} episodes ingested" in told
     assert (tmp_path / "rollouts" / "vilp-tiny-0-1" / "report.json").is_file()
-    assert "NOT within" not in make("replay", *words)
+    assert "3 of 3 end as recorded (3 in success)" in make("replay", *words)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from tests.pusht_human import N_EPISODES, human_episode, simulator
 from vilp_data.errors import UsageError
 from vilp_data.task_toml import parse_task
 from vilp_data.types import Episode
-from vilp_models.replay import format_replay, replay
+from vilp_models.replay import format_replay, format_replays, replay
 from vilp_models.simulator import make_env
 
 TOLERANCE_PX = 1e-3
@@ -106,6 +106,25 @@ def test_replay_refuses_a_simulator_with_another_state(integrated):
 
     with pytest.raises(UsageError, match="7 values, recorded 3"):
         replay(integrated, Longer())
+
+
+class Judged(Integrator):
+    """Succeeds where the sum is 3, and goes on."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, {**info, "is_success": self.state[0] == 3}
+
+
+def test_replay_says_whether_an_episode_ends_as_recorded(integrated):
+    won, lost = (replace(integrated, outcome=outcome) for outcome in ("success", "failure"))
+    assert replay(integrated, Integrator()).success is None
+    assert replay(replace(won, action=won.action + 1), Judged()).success is False
+    reports = [replay(episode, Judged()) for episode in (won, lost, integrated)]
+    assert [report.success for report in reports] == [True, True, True]
+    line = format_replays(reports, [True, True, False])
+    assert line == "2 of 3 episodes replay as recorded; 1 of 2 end as recorded (1 in success)"
+    assert format_replays([replay(won, Integrator())], [True]) == "1 of 1 episodes replay as recorded"
 
 
 class Plain(gymnasium.Env):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vilp_data.errors import UsageError
-from vilp_data.types import F32, F64, U8, Episode
+from vilp_data.types import F32, F64, U8, Episode, Outcome
 from vilp_models.metrics import psnr
 from vilp_models.starts import tagged_seed
 
@@ -39,10 +39,13 @@ class ReplayReport:
     """What playing an episode's actions gave. `shifted`: the same with each action one step early, which must not pass.
 
     The proof rests on the `controlled` dimensions; the others show how far the whole simulated episode drifts.
+    `recorded`: what the episode says it came to. `success`: whether a played step succeeded, None where the simulator does not say.
     """
 
     episode: str
     n_steps: int
+    recorded: Outcome
+    success: bool | None
     names: tuple[str, ...]
     controlled: tuple[int, ...]
     error: StateErrors
@@ -87,26 +90,38 @@ def replay(episode: Episode, env: Any, *, progress: Progress | None = None) -> R
     n_steps = len(states) - 1
     periods = np.array(env.metadata.get("state_periods", (np.inf,) * states.shape[1]))
     seed = tagged_seed(episode.tags)
-    errors = []
+    plays, errors = [], []
     for shift in (0, 1):
         told = None if progress is None else _behind(progress, before=shift * n_steps, total=2 * n_steps)
-        played = play(env, states[0], actions[shift : shift + n_steps], seed=seed, progress=told)
-        errors.append(_compare(played, states[1:], periods))
+        plays.append(play(env, states[0], actions[shift : shift + n_steps], seed=seed, progress=told))
+        errors.append(_compare(plays[-1].states, states[1:], periods))
     names = env.metadata.get("state_names", tuple(f"state[{i}]" for i in range(states.shape[1])))
     controlled = env.metadata.get("controlled_state", tuple(range(states.shape[1])))
-    return ReplayReport(episode.id, n_steps, tuple(names), tuple(controlled), *errors)
+    return ReplayReport(
+        episode.id, n_steps, episode.outcome, plays[0].success, tuple(names), tuple(controlled), *errors
+    )
 
 
-def play(env: Any, state: F64, actions: F32, *, seed: int | None = None, progress: Progress | None = None) -> F64:
-    """The states float64 [k,S] that follow `state` [S] when `actions` [k,A] are taken in turn, past success too."""
+@dataclass(frozen=True)
+class Play:
+    """What actions came to: the states float64 [k,S] after each, and whether any of them was a success (None: not said)."""
+
+    states: F64
+    success: bool | None
+
+
+def play(env: Any, state: F64, actions: F32, *, seed: int | None = None, progress: Progress | None = None) -> Play:
+    """Take `actions` [k,A] in turn from `state` [S], past success too."""
     env.reset(seed=seed, options={"state": state})
-    played = []
+    states, success = [], None
     for action in actions:
         _, _, _, _, info = env.step(action)
-        played.append(info["state"])
+        states.append(info["state"])
+        if "is_success" in info:
+            success = bool(success or info["is_success"])
         if progress is not None:
-            progress(len(played), len(actions))
-    return np.stack(played).astype(np.float64)
+            progress(len(states), len(actions))
+    return Play(np.stack(states).astype(np.float64), success)
 
 
 def _behind(progress: Progress, *, before: int, total: int) -> Progress:
@@ -210,6 +225,17 @@ def _verdict(report: ReplayReport, tolerance: float) -> str:
     if report.fails(tolerance):
         return f"NOT within {tolerance:g}"
     return f"within {tolerance:g}" + ("" if report.proves(tolerance) else ", but too alike to tell a step's shift")
+
+
+def format_replays(reports: Sequence[ReplayReport], proven: Sequence[bool]) -> str:
+    """A line for a terminal: how many of the episodes are `proven`, and how many came to what was recorded of them."""
+    line = f"{sum(proven)} of {len(reports)} episodes replay as recorded"
+    told = [report for report in reports if report.recorded != "unknown" and report.success is not None]
+    if told:
+        alike = sum(report.success == (report.recorded == "success") for report in told)
+        succeeded = sum(report.recorded == "success" for report in told)
+        line += f"; {alike} of {len(told)} end as recorded ({succeeded} in success)"
+    return line
 
 
 def format_render(report: RenderReport, *, minimum_db: float = RENDER_MIN_DB) -> list[str]:

@@ -190,29 +190,29 @@ def _settings(denoising_steps: int | None, sampler: str | None, precision: str) 
 
 
 def _prove_replay(root: Path, spec: TaskSpec, *, episodes: int | None, render: bool, as_json: bool) -> None:
-    from vilp_models.replay import format_render, format_replay, render_match, replay
+    from vilp_models.replay import format_render, format_replay, format_replays, render_match, replay
     from vilp_models.simulator import Worlds
 
     store = EpisodeStore(root)
     worlds = Worlds(spec, cameras=render)
-    reports, failed = [], 0
+    reports, proven, shown = [], [], []
     for entry in store.index()[:episodes]:
         episode = store.read(entry.id)
         env = worlds.of(episode.tags)
         tolerance = env.metadata.get("replay_tolerance")
         report = replay(episode, env)
-        reports.append(dataclasses.asdict(report))
-        failed += tolerance is not None and report.fails(tolerance)
+        reports.append(report)
+        proven.append(tolerance is None or not report.fails(tolerance))
         lines = format_replay(report, tolerance=tolerance)
+        shown.append(dataclasses.asdict(report))
         if render:
             match = render_match(episode, env)
-            failed += not match.proves()
+            proven[-1] &= match.proves()
             lines += format_render(match)
-            reports[-1]["render"] = dataclasses.asdict(match)
+            shown[-1]["render"] = dataclasses.asdict(match)
         if not as_json:
             print("\n".join(lines))
     worlds.close()
-    if as_json:
-        print_json(reports)
-    if failed:
+    print_json(shown) if as_json else print(format_replays(reports, proven))
+    if not all(proven):
         raise typer.Exit(1)
