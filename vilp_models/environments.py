@@ -58,8 +58,12 @@ class Environments:
         )
         return self._seen(observation, infos)
 
-    def step(self, actions: F32) -> tuple[Observation, Outcome]:
-        """Take `actions` float32 [B,A]. An environment that is done stays as it is, and earns nothing more."""
+    def step(self, actions: F32, *, draw: bool = True) -> tuple[Observation, Outcome]:
+        """Take `actions` float32 [B,A]. An environment that is done stays as it is, and earns nothing more.
+
+        Without `draw` the frames that come back are not to be looked at: simulators that can leave drawing out do so."""
+        for slot in self.slots:
+            slot.draw(draw)
         observation, reward, _, _, infos = self._vector.step(actions)
         success = np.array([bool(slot.info["is_success"]) for slot in self.slots])
         done = np.array([slot.done for slot in self.slots])
@@ -103,11 +107,18 @@ class Slot(gymnasium.Wrapper[Any, Any, Any, Any]):  # type: ignore[misc]  # gymn
         self.observation: Mapping[str, Any] = {}
         self.info: dict[str, Any] = {}
         self.reward = 0.0
+        self._drawing = getattr(env.unwrapped, "set_drawing", None)
+
+    def draw(self, on: bool) -> None:
+        """Whether the next steps draw the views; without, those drawn last stay in `observation`. Not every simulator can choose."""
+        if self._drawing is not None:
+            self._drawing(on)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Mapping[str, Any], dict[str, Any]]:
         """`options["states"]`: the state each environment begins at, None for one that draws its own."""
+        self.draw(True)
         state = None if options is None else options[self.STATES][self.number]
         self.observation, self.info = self.env.reset(seed=seed, options=None if state is None else {"state": state})
         self.done, self.reward = False, 0.0
@@ -118,7 +129,8 @@ class Slot(gymnasium.Wrapper[Any, Any, Any, Any]):  # type: ignore[misc]  # gymn
         """As the environment's, but never terminated or truncated: `done` says that."""
         if self.done:
             return self.observation, 0.0, False, False, self.info
-        self.observation, reward, terminated, truncated, self.info = self.env.step(action)
+        seen, reward, terminated, truncated, self.info = self.env.step(action)
+        self.observation = {**self.observation, **seen}
         self.reward, self.done = float(reward), bool(terminated or truncated)
         return self.observation, self.reward, False, False, self.info
 

@@ -138,8 +138,9 @@ class _Batch:
             step = 0
             while step < max_steps and not self.done.all():
                 chunk = self._plan(observation)
-                for action in chunk.swapaxes(0, 1)[: max_steps - step]:
-                    observation = self._step(action)
+                n_actions = min(len(chunk[0]), max_steps - step)
+                for i, action in enumerate(chunk.swapaxes(0, 1)[:n_actions], start=1):
+                    observation = self._step(action, looked_at=self.logs is not None or i == n_actions)
                     step += 1
                     if progress is not None:
                         progress(max_steps if self.done.all() else step)
@@ -170,14 +171,14 @@ class _Batch:
             )
         return chunk
 
-    def _step(self, action: F32) -> Observation:
+    def _step(self, action: F32, *, looked_at: bool) -> Observation:
         active = ~self.done
         if self.logs is not None:
             began = perf_counter()
             self.logs.tick(action, active)
             self.timing.logs += perf_counter() - began
         began = perf_counter()
-        observation, outcome = self.world.step(action)
+        observation, outcome = self.world.step(action, draw=looked_at)
         self.timing.environments += perf_counter() - began
         self._take_note(outcome, active)
         return observation

@@ -11,6 +11,8 @@ An environment is what `make_env` makes, and keeps to a small contract:
   keeps the robot where it is;
 - how long an episode may be says `sim.max_steps` alone: a limit that was registered with gymnasium does not count, and an
   environment that says `truncated` by itself ends the episode there;
+- where drawing takes long it may have a method `set_drawing(on)`: while told False, observations need not hold the views. A rollout without
+  logs draws only what the policy sees, once in `n_action_steps`;
 - `tags()`, where it has them, says what tells its world from others of the task ("goal", "object"), as its logs are tagged;
 - its metadata may say `state_names`, `state_periods` (inf where a value does not wrap around), `controlled_state` (the
   indices that the actions command; others also depend on contacts, and on what a state leaves out) and

@@ -6,13 +6,14 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium", reason="the simulators are not installed: make setup")
 
-from tests.models.toy_simulator import GOAL, dot_task
+from tests.models.toy_simulator import GOAL, Dot, dot_task
 from tests.stored_episodes import add_episodes
 from tests.stored_episodes import episode as random_episode
 from vilp_data.assemble import assemble_episode
@@ -99,6 +100,34 @@ def test_the_policy_sees_the_present_and_is_asked_once_a_chunk(spec: TaskSpec) -
     assert [float(seen.low_dim[0, 0]) for seen in policy.seen] == [1.0, 2.5]
     assert [int(seen.frames["top"][0, 0, 0, 0]) for seen in policy.seen] == [20, 50]
     assert policy.seen[0].hold_action.shape == (1, 1)
+
+
+def test_without_logs_a_simulator_draws_only_what_the_policy_looks_at(
+    spec: TaskSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3 actions a plan of 8 steps: drawn at the start, and after steps 3, 6 and 8. What the policy sees is the same."""
+    monkeypatch.setattr(Dot, "set_drawing", lambda self, on: vars(self).update(drawing=on), raising=False)
+    observe, drawn = Dot._observe, []
+
+    def observe_or_not(self: Dot) -> dict[str, Any]:
+        whole = observe(self)
+        if not getattr(self, "drawing", True):
+            del whole["top"]
+        drawn.append("top" in whole)
+        return whole
+
+    monkeypatch.setattr(Dot, "_observe", observe_or_not)
+    starts = [Start("s", 0, None, np.array([1.0, 0.0]))]
+    seen = []
+    for logs in (None, LogPlan(tmp_path, {})):
+        drawn.clear()
+        policy = RandomPolicy(1e-9, offset=0.5)
+        results, _ = roll_out(spec, policy, starts, max_steps=8, environments=1, logs=logs)
+        seen.append((results, [int(look.frames["top"][0, 0, 0, 0]) for look in policy.seen], drawn.count(True)))
+    (without, looks, few), (with_logs, same_looks, many) = seen
+    assert without == with_logs
+    assert looks == same_looks == [20, 50, 80]
+    assert (few, many) == (4, 9)
 
 
 def test_frames_come_at_the_size_the_dataset_stores() -> None:

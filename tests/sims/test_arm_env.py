@@ -131,6 +131,23 @@ def test_looking_does_not_change_what_happens(blind: ArmEnv[Any], demonstration:
         assert np.array_equal(blind.step(action)[4]["state"], expected)
 
 
+def test_what_is_drawn_between_two_looks_changes_nothing(task: str, demonstration: Demonstration) -> None:
+    kind, _, options = TASKS[task]
+    env = kind(**options)
+    env.reset(options={"state": demonstration.states[0]})
+    for step, action in enumerate(demonstration.actions[:6]):
+        env.set_drawing(step % 3 == 2)
+        observation, *_, info = env.step(action)
+        assert np.array_equal(info["state"], demonstration.states[step + 1])
+        assert set(observation) == {"low_dim", *(env.views if step % 3 == 2 else ())}
+    late = {view: observation[view] for view in env.views}
+    env.reset(options={"state": demonstration.states[0]})
+    for action in demonstration.actions[:6]:
+        observation, *_ = env.step(action)
+    assert all(np.array_equal(observation[view], late[view]) for view in env.views)
+    env.close()
+
+
 def test_a_seed_gives_the_same_start_in_any_environment(task: str, blind: ArmEnv[Any]) -> None:
     kind, _, options = TASKS[task]
     another = kind(**options, cameras=False)

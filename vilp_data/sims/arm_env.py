@@ -57,7 +57,7 @@ class Proprioception:
 class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: ignore[misc]  # gymnasium is not followed
     """One arm at a task.
 
-    observation  each view of the scene: uint8 [height,width,3] RGB, top row first (absent with cameras=False);
+    observation  each view of the scene: uint8 [height,width,3] RGB, top row first (none with cameras=False, or after `set_drawing(False)`);
                  low_dim: float32 [9], end-effector position, quaternion (x, y, z, w), finger joints
     action       float32 [7]: position delta in m (±0.05), axis-angle delta in rad (±0.5), both in the base frame and from the
                  pose reached so far; gripper -1 open, +1 close
@@ -88,6 +88,7 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
         self.observation_space = _observation_space(self.views, height, width)
         self._gripper_command = GRIPPER_OPEN
         self._ee_quaternion = HAND_DOWN
+        self._drawing = True
 
     # --- what a task says
 
@@ -137,6 +138,10 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
     def render(self) -> Any:
         """All views side by side, uint8 [height, n width, 3]; None without cameras."""
         return np.concatenate([self._image(name) for name in self.views], axis=1) if self.cameras else None
+
+    def set_drawing(self, on: bool) -> None:
+        """Whether observations hold the views from now on; one that nobody looks at takes most of a step's time."""
+        self._drawing = on
 
     def close(self) -> None:
         self.scene.close()
@@ -209,7 +214,8 @@ class ArmEnv(gymnasium.Env[dict[str, Any], F32], Generic[Scene], ABC):  # type: 
     def _observation(self) -> dict[str, Any]:
         now = self._proprioception()
         low_dim = np.concatenate([now.ee_position, now.ee_quaternion, now.gripper_position]).astype(np.float32)
-        return {**{name: self._image(name) for name in self.views}, "low_dim": low_dim}
+        drawn = self.views if self._drawing else ()
+        return {**{name: self._image(name) for name in drawn}, "low_dim": low_dim}
 
     def _info(self, samples: list[Proprioception]) -> dict[str, Any]:
         return {
