@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,18 @@ def summary(table: Mapping[str, Any], folder: Path) -> list[str]:
 
 
 def _cells(part: PartReport, name: str, policies: list[str]) -> list[str]:
-    gains = [estimate_words(part.gain(policy, name), 3, sign=True) if name in GUESSES else "" for policy in policies]
-    return [NAMES[name], estimate_words(part.mae(name), 3), estimate_words(part.rmse(name), 3), *gains]
+    digits = _digits(part)
+    gains = [
+        estimate_words(part.gain(policy, name), digits, sign=True) if name in GUESSES else "" for policy in policies
+    ]
+    return [NAMES[name], estimate_words(part.mae(name), digits), estimate_words(part.rmse(name), digits), *gains]
+
+
+def _digits(part: PartReport) -> int:
+    """Decimals that show three digits of the smallest error, 3 to 6: metres are small, pixels are not."""
+    errors = [part.mae(name).value for name in part.absolute]
+    positive = [error for error in errors if error > 0]
+    return min(max(3, 2 - math.floor(math.log10(min(positive)))), 6) if positive else 3
 
 
 def _part_table(part: PartReport) -> dict[str, Any]:

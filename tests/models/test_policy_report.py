@@ -144,6 +144,17 @@ def test_a_policy_no_better_than_a_guess_is_said_so(dataset: EpisodeStore, tmp_p
     assert "**Warning:** do not act" in (tmp_path / "evaluation" / "report.md").read_text()
 
 
+@pytest.mark.parametrize(
+    ("error", "row"), [(0.00123, "| policy, true frames | 0.00123 |"), (1.5, "| policy, true frames | 1.500 |")]
+)
+def test_small_errors_are_shown_with_their_digits(
+    dataset: EpisodeStore, tmp_path: Path, error: float, row: str
+) -> None:
+    report = report_of(dataset, Known(answers(dataset), error=error), decoded=False)
+    write_policy_report(report, tmp_path, {})
+    assert row in (tmp_path / "report.md").read_text()
+
+
 def test_staying_is_no_motion_for_deltas_the_low_dim_that_the_task_tells_or_the_last_command() -> None:
     spec = TaskSpec.model_validate(
         {
