@@ -46,8 +46,8 @@ def markdown_table(titles: str, rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def number(value: float) -> float | None:
-    """For JSON: what is not defined is null."""
-    return None if math.isnan(value) else round(value, 4)
+    """For JSON, to 4 decimals, or as many digits of what is small; what is not defined is null."""
+    return None if math.isnan(value) else float(f"{value:.4{'f' if abs(value) >= 1 else 'g'}}")
 
 
 def estimate_table(estimate: Estimate) -> dict[str, float | None]:

@@ -209,7 +209,7 @@ def write_rollout(report: RolloutReport, folder: Path, spec: TaskSpec, *, with_v
             write_mp4(
                 folder / "videos" / f"{name}.mp4", frames, fps=fps, scale=-(-VIDEO_SIDE // min(frames.shape[1:3]))
             )
-    write_report_files(folder, report.to_json(), to_markdown(report), {})
+    write_report_files(folder, report.to_json(), to_markdown(report, with_videos=with_videos), {})
 
 
 def log_film(path: Path, spec: TaskSpec) -> tuple[U8, float]:
@@ -251,8 +251,8 @@ def _verdict(difference: Estimate) -> str:
     return ": below" if difference.is_below_zero else ""
 
 
-def to_markdown(report: RolloutReport) -> str:
-    """The page for people."""
+def to_markdown(report: RolloutReport, *, with_videos: bool = True) -> str:
+    """The page for people; it names the episodes that there are videos of."""
     table = report.to_json()
     tags = [f"- {name}: `{value}`" for name, value in sorted(report.tags.items())]
     summary = [
@@ -264,7 +264,7 @@ def to_markdown(report: RolloutReport) -> str:
             f"| max reward, minus `{other.policy}` | {estimate_words(other.max_reward, 3, sign=True)} |",
             f"| success, minus `{other.policy}` | {estimate_words(other.success, 3, sign=True)} |",
         ]
-    chosen = {episode.name: word for word, episode in report.chosen().items()}
+    chosen = {episode.name: word for word, episode in report.chosen().items()} if with_videos else {}
     rows = [
         (e.name, f"{e.max_reward:.3f}", "yes" if e.success else "no", str(e.n_steps), chosen.get(e.name, ""))
         for e in report.episodes

@@ -377,6 +377,17 @@ def test_no_episode_is_filmed_twice(spec: TaskSpec, tmp_path: Path, n_starts: in
     assert {path.stem for path in tmp_path.glob("videos/*")} == videos
 
 
+def test_without_logs_there_are_no_videos_and_the_page_names_none(spec: TaskSpec, tmp_path: Path) -> None:
+    for with_logs in (True, False):
+        folder = tmp_path / str(with_logs)
+        roll_out_into(
+            folder, spec, StayPolicy(n_action_steps=3), seed_starts(range(3)), name="stay", what="x", max_steps=20, environments=4,
+            with_logs=with_logs,
+        )  # fmt: skip
+        assert (folder / "videos").exists() == with_logs
+        assert ("| best |" in (folder / "report.md").read_text()) == with_logs
+
+
 def test_a_single_start_has_no_interval_and_is_still_valid_json(spec: TaskSpec, tmp_path: Path) -> None:
     stayed(tmp_path, spec, range(1))
     table = json.loads((tmp_path / "report.json").read_text())
