@@ -85,7 +85,7 @@ dream: planner policy
 	@$(BIN)/vilp-data view --generated planner-$(PRESET)$(if $(SET),-$(basename $(notdir $(SET)))) --data $(DATA) --html $(DATA)/dream.html
 
 rollout: planner policy
-	@$(BIN)/vilp-models rollout $(MODEL) --policy stay --seeds $(SEEDS)
+	@$(BIN)/vilp-models rollout $(MODEL) --policy stay --seeds $(SEEDS) --no-logs
 	@$(BIN)/vilp-models rollout $(MODEL) $(LABELS) --policy vilp --seeds $(SEEDS)
 
 # do off-target labels help? three seeds of each model on both sets: hours, and it goes on where it stopped
